@@ -1,0 +1,29 @@
+"""Environments of the reproduction, registered with Gymnasium on import.
+
+Navigation: `Pillars-0.15-Goal-v0`, `Pillars-0.30-Goal-v0`, `Hazards-0.15-Push-v0` and
+`Hazards-0.30-Push-v0`, for `gymnasium.make` and for `gymnasium.make_vec` with
+`vectorization_mode="vector_entry_point"`. See docs/environments.md.
+
+Two aircraft: `Aircraft-v0`. See docs/aircraft.md.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from envs.tasks import NAVIGATION_TASKS
+
+for _task in NAVIGATION_TASKS.values():
+    gymnasium.register(
+        id=f"{_task.name}-v0",
+        entry_point="envs.navigation:NavigationEnv",
+        vector_entry_point="envs.navigation:NavigationVectorEnv",
+        max_episode_steps=_task.max_episode_steps,
+        kwargs={"task": _task.name},
+    )
+
+gymnasium.register(
+    id="Aircraft-v0",
+    entry_point="envs.aircraft:AircraftEnv",
+    vector_entry_point="envs.aircraft:AircraftVectorEnv",
+)

@@ -1,0 +1,80 @@
+"""Top-down drawings of navigation scenes; they need matplotlib but no OpenGL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.navigation_batch import Scene
+from envs.tasks import ROBOT_RADIUS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+ROBOT_COLOR = "#d62728"
+OBSTACLE_COLOR = "#1f4e9c"
+GOAL_COLOR = "#2ca02c"
+BOX_COLOR = "#cc9a1f"
+NOSE = 0.15  # m, how far the arrow reaches ahead
+BOX_HALF, COLUMN_OFFSET, COLUMN_HALF = 0.2, 0.2, 0.1  # m, as in assets/hazards_push.xml
+
+
+def draw_scene(
+    ax: Axes, scene: Scene, trajectory: NDArray[np.float64] | None = None, margin: float = 0.3
+) -> Axes:
+    """Draw robot with heading, goal, obstacles, box and, if given, a trajectory [T, 2] on `ax`.
+
+    The dotted circles around pillars are d_min, which the robot's centre must not enter. Axes are
+    in metres; the view is the square that layouts are drawn from, widened to the trajectory.
+    """
+    from matplotlib.patches import Circle, Polygon
+
+    task = scene.task
+    if trajectory is not None:
+        path = np.asarray(trajectory)
+        ax.plot(path[:, 0], path[:, 1], color=ROBOT_COLOR, lw=1.0, alpha=0.6, zorder=3)
+    goal = Circle(
+        _point(scene.goal), task.goal_size, fc=GOAL_COLOR, ec=GOAL_COLOR, alpha=0.45, zorder=1
+    )
+    ax.add_patch(goal)
+    alpha = 1.0 if task.solid_obstacles else 0.5
+    for xy in scene.obstacles:
+        ax.add_patch(
+            Circle(_point(xy), task.obstacle_size, fc=OBSTACLE_COLOR, alpha=alpha, zorder=2)
+        )
+        if task.d_min > task.obstacle_size:
+            ax.add_patch(
+                Circle(_point(xy), task.d_min, fill=False, ec=OBSTACLE_COLOR, ls=":", zorder=2)
+            )
+    if scene.box is not None:
+        for corners in _box_outlines(scene.box):
+            ax.add_patch(Polygon(corners, closed=True, fc=BOX_COLOR, ec="none", zorder=4))
+    position, heading = scene.robot[:2], scene.robot[2]
+    ax.add_patch(Circle(_point(position), ROBOT_RADIUS, fc=ROBOT_COLOR, ec="none", zorder=5))
+    nose = _rotated(np.array([[0.0, -0.05], [NOSE, -0.05], [NOSE, 0.05], [0.0, 0.05]]), heading)
+    ax.add_patch(Polygon(nose + position, closed=True, fc=ROBOT_COLOR, ec="none", zorder=5))
+    tip = _rotated(np.array([[2 * NOSE, 0.0]]), heading)[0] + position
+    ax.plot(*zip(position, tip, strict=True), color="black", lw=1.0, zorder=6)
+    shown = np.array([scene.robot[:2], scene.goal] if trajectory is None else [*path, scene.goal])
+    lower = np.minimum(shown.min(axis=0), -task.extent) - margin
+    upper = np.maximum(shown.max(axis=0), task.extent) + margin
+    ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    return ax
+
+
+def _box_outlines(box: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    parts = [BOX_HALF * square] + [COLUMN_HALF * square + COLUMN_OFFSET * c for c in square]
+    return [_rotated(part, box[2]) + box[:2] for part in parts]
+
+
+def _point(xy: NDArray[np.float64]) -> tuple[float, float]:
+    return float(xy[0]), float(xy[1])
+
+
+def _rotated(points: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    return points @ np.array([[c, s], [-s, c]])
