@@ -1,0 +1,25 @@
+# From nothing to every table and figure: `snakemake -j2 all`.
+# Training runs are content-addressed (workflow/rules/train.smk), so what is already recorded under
+# results/ is not trained again, in a fresh clone neither.
+from snakemake.utils import min_version
+
+min_version("9.14")
+
+
+report: "workflow/report/workflow.rst"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/recovery.smk"
+include: "workflow/rules/train.smk"
+include: "workflow/rules/outside.smk"
+include: "workflow/rules/aggregate.smk"
+include: "workflow/rules/figures.smk"
+include: "workflow/rules/sensitivity.smk"
+include: "workflow/rules/aircraft.smk"
+
+
+rule all:
+    default_target: True
+    input:
+        TARGETS,

@@ -1,0 +1,423 @@
+"""Feasible actor-critic (FAC): soft actor-critic with a state-wise energy constraint.
+
+Ma et al., "Feasible actor-critic: constrained reinforcement learning for ensuring statewise
+safety" (2021), as used by the SafeMR paper with a fixed energy function: phi_0 = d_min - d is
+zeta = [0, 0, 1] and phi_h = (0.3 + d_min)^2 - d^2 - k d_dot is zeta = [0.3, k, 2]. JointSIS and
+SafeMR extend this file by their certificate loss.
+
+| equation of the paper | function |
+|---|---|
+| phi (sis), constraint g (cstr0) | `safemr.energy.energy`, `safemr.energy.constraint` |
+| Q_w regression (soft Bellman target) | `reward_target` |
+| Q_phi regression on g | `constraint_values`, the third member of the critic stack |
+| J_pi (losspi) | `policy_loss` |
+| dual ascent on E[lambda(s) Q_phi(s, a)] | `multiplier_loss` |
+| temperature (Haarnoja et al. 2018) | `temperature_loss` |
+| delays m_pi < m_lambda < m_phi (Alg. 1) | `Agent.update` |
+
+Deviations from the paper and from the authors' released code, each a field of `Config`:
+minimum of two critics (usual practice; Eq. losspi has one), n-step returns, the multiplier is
+trained on the current policy's action instead of the replayed one, larger learning rates and
+smaller networks for a budget two orders of magnitude smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from safemr import energy, off_policy
+from safemr.buffers import Batch
+from safemr.errors import UserError
+from safemr.networks import ACTIVATIONS, Activation, StackedMLP, squashed_gaussian
+from safemr.policies import network_arrays
+from safemr.training import generator
+
+VERSION = 1
+
+REWARD_CRITICS = 2  # twin critics; the constraint critic is the third member of the stack
+
+
+@dataclass(frozen=True)
+class Config:
+    """Hyperparameters. Lengths in units of ``length_scale`` metres; steps are environment steps."""
+
+    # Energy function: start (FAC: constant) of zeta = [sigma, k, n].
+    sigma: float = 0.3
+    k: float = 1.0
+    n: float = 2.0
+    eta: float = 0.0  # eta_D; the point robot cannot sustain a descent of 0.1 a step
+    length_scale: float = 1.0  # unit of length in phi [m]; 1 = the paper's
+
+    # Constraint: one function, max(g, constraint_floor), for critic, multiplier and certificate.
+    # Far from danger g is large and negative; without a floor it outweighs the rare violations in
+    # the shared multiplier network and lambda dies.
+    constraint_floor: float = -0.001
+    constraint_scale: float = 10.0  # Q_phi learns scale * g, so that its errors count beside Q_w's
+
+    # Multiplier network lambda(s) = softplus(.), capped.
+    multiplier_bias: float = -3.0  # start of the last layer's bias
+    multiplier_cap: float = 100.0
+    multiplier_lr: float = 3e-4
+    multiplier_grad_norm: float = 3.0
+    multiplier_action: Literal["policy", "replay"] = "policy"
+
+    # Soft actor-critic.
+    gamma: float = 0.99
+    polyak: float = 0.005
+    n_step: int = 5
+    critic_lr: float = 1e-3
+    policy_lr: float = 1e-3
+    temperature_lr: float = 3e-4
+    initial_log_temperature: float = -4.0
+    target_entropy: float = -2.0
+    lr_final: float = 0.1  # every learning rate falls linearly to this share of its start
+    hidden: int = 64
+    activation: Activation = "relu"
+
+    # Delays in gradient steps (Algorithm 1).
+    policy_delay: int = 2  # m_pi
+    multiplier_delay: int = 4  # m_lambda
+
+    # Experience.
+    num_envs: int = 16
+    update_every: int = 8  # environment steps per gradient step
+    updates_together: int = 4  # gradient steps done in one go, sharing one draw and its targets
+    batch_size: int = 256
+    replay_capacity: int = 500_000
+    start_steps: int = 5_000  # random actions first,
+    start_hold: int = 10  # each held for this many steps
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        positive = (
+            "length_scale constraint_scale multiplier_cap multiplier_lr multiplier_grad_norm "
+            "critic_lr policy_lr temperature_lr n_step hidden policy_delay multiplier_delay "
+            "num_envs update_every updates_together batch_size replay_capacity start_hold"
+        )
+        for name in positive.split():
+            if not getattr(self, name) > 0:
+                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
+        for name in ("sigma", "k", "n", "eta", "start_steps"):
+            if not getattr(self, name) >= 0:
+                raise UserError(f"{name} = {getattr(self, name)!r} must not be negative")
+        for name in ("gamma", "polyak", "lr_final"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UserError(f"{name} = {getattr(self, name)!r} must lie in [0, 1]")
+        if self.constraint_floor > 0:
+            raise UserError(f"constraint_floor = {self.constraint_floor!r} must not be positive")
+        if self.multiplier_delay % self.policy_delay:
+            raise UserError(
+                f"multiplier_delay = {self.multiplier_delay} must be a multiple of policy_delay = "
+                f"{self.policy_delay}: the multiplier uses that step's policy action"
+            )
+        if self.activation not in ACTIVATIONS:
+            raise UserError(f"activation = {self.activation!r}: use one of {ACTIVATIONS}")
+        if self.multiplier_action not in ("policy", "replay"):
+            raise UserError(
+                f"multiplier_action = {self.multiplier_action!r}: use 'policy' or 'replay'"
+            )
+
+
+def reward_target(
+    returns: Tensor,
+    discounts: Tensor,
+    next_values: Tensor,
+    next_log_densities: Tensor,
+    temperature: Tensor,
+) -> Tensor:
+    """y = R^(m) + gamma^m (min_j Q_wj(s', a') - alpha log pi(a'|s')), [B].
+
+    next_values [2, B] from the target networks; discounts are 0 after a termination.
+    """
+    soft = next_values.amin(0) - temperature * next_log_densities
+    return torch.addcmul(returns, discounts, soft)
+
+
+def constraint_values(batch: Batch, zeta: Tensor, d_min: float, config: Config) -> Tensor:
+    """max(g(s, a), constraint_floor) with the current zeta (Eq. cstr0), [B].
+
+    No bootstrap: the constraint is about one step. Differentiable in zeta.
+    """
+    sigma, k, n = zeta.unbind()
+    phi, phi_next = (
+        energy.largest(
+            energy.energy(*energy.scaled(d, d_dot, d_min, config.length_scale), sigma, k, n)
+        )
+        for d, d_dot in ((batch.d, batch.d_dot), (batch.d_next, batch.d_dot_next))
+    )
+    return energy.constraint(phi, phi_next, config.eta).clamp_min(config.constraint_floor)
+
+
+def critic_loss(predictions: Tensor, targets: Tensor) -> Tensor:
+    """Sum over the stack of mean squared errors; predictions, targets [K, B]."""
+    return (predictions - targets).square().mean(1).sum()
+
+
+def policy_loss(
+    log_densities: Tensor,
+    values: Tensor,
+    constraint: Tensor,
+    multipliers: Tensor,
+    temperature: Tensor,
+) -> Tensor:
+    """J_pi = E[alpha log pi(a|s) - min_j Q_wj(s, a) + lambda(s) Q_phi(s, a)] (Eq. losspi).
+
+    values [2, B]; the rest [B]; lambda and alpha detached.
+    """
+    return (temperature * log_densities - values.amin(0) + multipliers * constraint).mean()
+
+
+def multiplier_loss(multipliers: Tensor, constraint: Tensor) -> Tensor:
+    """-E[lambda(s) Q_phi(s, a)] with Q_phi detached: descending it is dual ascent."""
+    return -(multipliers * constraint.detach()).mean()
+
+
+def temperature_loss(
+    log_temperature: Tensor, log_densities: Tensor, target_entropy: float
+) -> Tensor:
+    """-log alpha (E[log pi(a|s)] + target entropy)."""
+    return -log_temperature * (log_densities.detach().mean() + target_entropy)
+
+
+class Agent:
+    """Networks and optimisers; one call of `update` is one gradient step."""
+
+    def __init__(
+        self,
+        config: Config,
+        observation_dim: int,
+        action_dim: int,
+        d_min: float,
+        seed: int,
+        total_updates: int,
+    ) -> None:
+        self.config, self.d_min, self.total_updates = config, d_min, max(total_updates, 1)
+        self.updates = 0
+        weights = generator(seed, 0)
+        self.noise = generator(seed, 1, config.device)
+        self.action_dim = action_dim
+
+        def network(count: int, inputs: int, outputs: int, **kwargs: Any) -> StackedMLP:
+            sizes = (inputs, config.hidden, config.hidden, outputs)
+            return StackedMLP(
+                count,
+                sizes,
+                config.activation,
+                generator=weights,
+                device=config.device,
+                **kwargs,
+            )
+
+        both = observation_dim + action_dim
+        self.critics = network(REWARD_CRITICS + 1, both, 1)
+        self.policy = network(1, observation_dim, 2 * action_dim, output_gain=0.1)
+        self.multiplier = network(
+            1, observation_dim, 1, output_gain=0.1, output_bias=config.multiplier_bias
+        )
+        self.targets = self.critics.copy(REWARD_CRITICS)
+        self.zeta = torch.tensor([config.sigma, config.k, config.n], device=config.device)
+        self.log_temperature = torch.tensor(
+            config.initial_log_temperature, device=config.device, requires_grad=True
+        )
+        self._optimisers = {
+            "critics": self._adam(self.critics.parameters, config.critic_lr),
+            "policy": self._adam(self.policy.parameters, config.policy_lr),
+            "multiplier": self._adam(self.multiplier.parameters, config.multiplier_lr),
+            "temperature": self._adam(self.log_temperature, config.temperature_lr),
+        }
+
+    @staticmethod
+    def _adam(parameters: Tensor, lr: float) -> torch.optim.Adam:
+        return torch.optim.Adam([parameters], lr=lr, fused=True)
+
+    def _noise(self, count: int) -> Tensor:
+        return torch.randn(count, self.action_dim, generator=self.noise, device=self.config.device)
+
+    @torch.no_grad()
+    def act(self, observations: Tensor) -> Tensor:
+        """Exploring actions [N, A] in (-1, 1) for transformed observations [N, D]."""
+        output = self.policy(observations)[0]
+        return squashed_gaussian(output, self._noise(len(observations)))[0]
+
+    def multipliers(self, observations: Tensor) -> Tensor:
+        """lambda_xi(s) in [0, cap], [B]."""
+        raw = self.multiplier(observations)[0, :, 0]
+        return torch.nn.functional.softplus(raw).clamp_max(self.config.multiplier_cap)
+
+    def constraint_target(self, batch: Batch) -> Tensor:
+        """What the third critic regresses on, [B]; here max(g, floor), no bootstrap."""
+        return constraint_values(batch, self.zeta, self.d_min, self.config)
+
+    def update(self, drawn: Batch, parts: int, measure: bool = False) -> dict[str, Tensor]:
+        """``parts`` gradient steps (Algorithm 1), each on its share of the transitions drawn.
+
+        The regression targets of all of them are formed at once, with the networks as they are at
+        the start: the target networks move 0.5% a step, and one large product costs far less than
+        several small ones. With ``measure`` returns the metrics of the last step of each kind.
+        """
+        config = self.config
+        targets = self.critic_targets(drawn)
+        info: dict[str, Tensor] = {}
+        steps = zip(drawn.split(parts), targets.chunk(parts, 1), strict=True)
+        for batch, target in steps:
+            self._set_learning_rates()
+            self.updates += 1
+            info |= self._update_critics(batch, target, measure)
+            if self.updates % config.policy_delay == 0:
+                with_multiplier = self.updates % config.multiplier_delay == 0
+                info |= self._update_policy(batch, with_multiplier, measure)
+            info |= self.update_certificate(batch)
+        self.targets.follow(self.critics, 1.0 - (1.0 - config.polyak) ** parts)
+        return info if measure else {}
+
+    def update_certificate(self, batch: Batch) -> dict[str, Tensor]:
+        """FAC keeps zeta; JointSIS and SafeMR move it. Returns metrics."""
+        return {}
+
+    @torch.no_grad()
+    def critic_targets(self, batch: Batch) -> Tensor:
+        """What the critic stack regresses on, [3, B]: twice the soft return, then the constraint."""
+        noise = self._noise(len(batch.returns))
+        action, log_density = squashed_gaussian(self.policy(batch.bootstraps)[0], noise)
+        following = self.targets(torch.cat((batch.bootstraps, action), 1))[..., 0]
+        soft = reward_target(
+            batch.returns, batch.discounts, following, log_density, self.log_temperature.exp()
+        )
+        constraint = self.config.constraint_scale * self.constraint_target(batch)
+        return torch.stack((soft,) * REWARD_CRITICS + (constraint,))
+
+    def _update_critics(self, batch: Batch, target: Tensor, measure: bool) -> dict[str, Tensor]:
+        values = self.critics(torch.cat((batch.observations, batch.actions), 1))[..., 0]
+        loss = critic_loss(values, target)
+        gradient = self._step("critics", self.critics.parameters, loss)
+        if not measure:
+            return {}
+        return {
+            "critic_loss": loss.detach(),
+            "critic_grad_norm": gradient.norm(),
+            "value_mean": values[0].detach().mean(),
+            "violating_share": (target[REWARD_CRITICS] > 0).float().mean(),
+        }
+
+    def _update_policy(
+        self, batch: Batch, with_multiplier: bool, measure: bool
+    ) -> dict[str, Tensor]:
+        config, observations = self.config, batch.observations
+        output = self.policy(observations)[0]
+        action, log_density = squashed_gaussian(output, self._noise(len(output)))
+        values = self.critics.frozen(torch.cat((observations, action), 1))[..., 0]
+        constraint = values[REWARD_CRITICS] / config.constraint_scale
+        with torch.set_grad_enabled(with_multiplier):
+            multipliers = self.multipliers(observations)
+        loss = policy_loss(
+            log_density,
+            values[:REWARD_CRITICS],
+            constraint,
+            multipliers.detach(),
+            self.log_temperature.detach().exp(),
+        )
+        gradient = self._step("policy", self.policy.parameters, loss)
+        self._step(
+            "temperature",
+            self.log_temperature,
+            temperature_loss(self.log_temperature, log_density, config.target_entropy),
+        )
+        info: dict[str, Tensor] = {}
+        if measure:
+            info = {
+                "policy_loss": loss.detach(),
+                "policy_grad_norm": gradient.norm(),
+                "entropy": -log_density.detach().mean(),
+                "multiplier_mean": multipliers.detach().mean(),
+                "multiplier_max": multipliers.detach().amax(),
+                "constraint_mean": constraint.detach().mean(),
+            }
+        if with_multiplier:
+            if config.multiplier_action == "replay":
+                both = torch.cat((observations, batch.actions), 1)
+                with torch.no_grad():
+                    constraint = self.critics(both)[REWARD_CRITICS, :, 0] / config.constraint_scale
+            dual = multiplier_loss(multipliers, constraint)
+            gradient = self._step(
+                "multiplier", self.multiplier.parameters, dual, config.multiplier_grad_norm
+            )
+            if measure:
+                info["multiplier_grad_norm"] = gradient.norm()
+        return info
+
+    def _step(
+        self, name: str, parameters: Tensor, loss: Tensor, max_norm: float | None = None
+    ) -> Tensor:
+        """One optimiser step on ``loss``; returns the gradient."""
+        (gradient,) = torch.autograd.grad(loss, [parameters])
+        if max_norm is not None:
+            gradient.mul_((max_norm / (gradient.norm() + 1e-6)).clamp_max(1.0))
+        parameters.grad = gradient
+        self._optimisers[name].step()
+        return gradient
+
+    def _set_learning_rates(self) -> None:
+        config = self.config
+        share = 1.0 - (1.0 - config.lr_final) * min(self.updates / self.total_updates, 1.0)
+        start = {
+            "critics": config.critic_lr,
+            "policy": config.policy_lr,
+            "multiplier": config.multiplier_lr,
+            "temperature": config.temperature_lr,
+        }
+        for name, optimiser in self._optimisers.items():
+            optimiser.param_groups[0]["lr"] = start[name] * share
+
+    def metrics(self) -> dict[str, float]:
+        """State of the agent for the log: zeta and the temperature."""
+        sigma, k, n = self.zeta.tolist()
+        return {
+            "sigma": sigma,
+            "k": k,
+            "n": n,
+            "temperature": float(self.log_temperature.detach().exp()),
+            "updates": float(self.updates),
+        }
+
+    def extras(self) -> dict[str, Any]:
+        """What figures need beside the policy: lambda's network and zeta."""
+        return {
+            **network_arrays("multiplier", self.multiplier),
+            "multiplier_cap": np.array(self.config.multiplier_cap),
+            "zeta": self.zeta.detach().cpu().numpy().copy(),
+            "length_scale": np.array(self.config.length_scale),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        networks = ("critics", "targets", "policy", "multiplier")
+        return {
+            "updates": self.updates,
+            "noise": self.noise.get_state(),
+            "zeta": self.zeta.detach(),
+            "log_temperature": self.log_temperature.detach(),
+            "networks": {name: getattr(self, name).parameters.detach() for name in networks},
+            "optimisers": {name: o.state_dict() for name, o in self._optimisers.items()},
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.updates = int(state["updates"])
+        self.noise.set_state(state["noise"].cpu())
+        with torch.no_grad():
+            self.zeta.copy_(state["zeta"])
+            self.log_temperature.copy_(state["log_temperature"])
+        for name, values in state["networks"].items():
+            getattr(self, name).load(values)
+        for name, optimiser in self._optimisers.items():
+            optimiser.load_state_dict(state["optimisers"][name])
+
+
+class Trainer(off_policy.Trainer):
+    """The off-policy loop around this file's `Agent`."""
+
+    agent_type = Agent

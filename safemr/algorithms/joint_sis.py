@@ -1,0 +1,130 @@
+"""JointSIS: joint synthesis of safe policy and energy function, without regard to efficiency.
+
+Ma et al., "Joint synthesis of safety certificate and safe control policy using constrained
+reinforcement learning" (L4DC 2022): feasible actor-critic plus a descent step on the energy's
+parameters zeta = [sigma, k, n].
+
+| equation of the paper | function |
+|---|---|
+| Lagrangian's dependence on zeta (SL2) | `certificate_loss` |
+| projection of zeta to a box | `Agent.update_certificate` |
+
+Deviations. The same constraint function max(g, constraint_floor) as in critic and multiplier also
+enters here (``certificate_constraint = "floored"``), since all three belong to one Lagrangian; the
+literal Eq. SL2 is ``"literal"``, and the loss of the authors' released code, E[max(g, 0)] without
+the multiplier, is ``"released"``. Plain gradient steps instead of Adam: Adam moves every parameter
+at one speed and so hides what the loss says. zeta's total travel is what `certificate_travel`
+allows it to be: see docs/tuning.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from safemr.algorithms import fac
+from safemr.buffers import Batch
+from safemr.errors import UserError
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Config(fac.Config):
+    """FAC's hyperparameters and those of the certificate; sigma, k, n are zeta's start."""
+
+    certificate_constraint: Literal["floored", "literal", "released"] = "floored"
+    certificate_delay: int = 16  # m_phi
+    # Sum over the run of zeta's learning rates (they fall linearly to 0), so that budgets of
+    # different length move zeta equally far: it is a hyperparameter, equal for JointSIS and SafeMR.
+    certificate_travel: float = 0.33
+    certificate_start: float = 0.05  # share of training before zeta moves
+    # Box of zeta; the floor of sigma keeps a margin beyond contact.
+    sigma_min: float = 0.05
+    sigma_max: float = 1.0
+    k_min: float = 0.1
+    k_max: float = 3.0
+    n_min: float = 0.1
+    n_max: float = 4.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("sigma", "k", "n"):
+            low, high = getattr(self, f"{name}_min"), getattr(self, f"{name}_max")
+            if not low <= getattr(self, name) <= high:
+                raise UserError(f"{name} = {getattr(self, name)!r} must lie in [{low}, {high}]")
+        if not (self.certificate_delay > 0 and self.certificate_travel >= 0):
+            raise UserError("certificate_delay must be positive, certificate_travel not negative")
+        if not 0 <= self.certificate_start < 1:
+            raise UserError(f"certificate_start = {self.certificate_start!r} must lie in [0, 1)")
+        if self.certificate_constraint not in ("floored", "literal", "released"):
+            raise UserError(
+                f"certificate_constraint = {self.certificate_constraint!r}: use 'floored', "
+                "'literal' or 'released'"
+            )
+
+
+def certificate_loss(
+    batch: Batch, multipliers: Tensor, zeta: Tensor, d_min: float, config: Config
+) -> Tensor:
+    """E[lambda(s) (phi(s') - max(phi(s) - eta_D, 0))] as a function of zeta (Eq. SL2).
+
+    ``floored`` and ``released`` replace g by max(g, floor) and lambda g by max(g, 0).
+    """
+    if config.certificate_constraint == "released":
+        return fac.constraint_values(
+            batch, zeta, d_min, replace(config, constraint_floor=0.0)
+        ).mean()
+    if config.certificate_constraint == "literal":
+        config = replace(config, constraint_floor=-torch.inf)
+    return (multipliers * fac.constraint_values(batch, zeta, d_min, config)).mean()
+
+
+class Agent(fac.Agent):
+    """Feasible actor-critic whose zeta descends `certificate_loss`."""
+
+    config: Config
+
+    def __init__(self, config: Config, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        bounds = [
+            [getattr(config, f"{name}_{end}") for name in "sigma k n".split()]
+            for end in ("min", "max")
+        ]
+        self._low, self._high = torch.tensor(bounds, device=config.device)
+        first = int(config.certificate_start * self.total_updates)
+        moves = max((self.total_updates - first) // config.certificate_delay, 1)
+        self._first_update = first
+        # A rate falling linearly from r to 0 sums to r * moves / 2.
+        self._rate = 2.0 * config.certificate_travel / moves
+
+    def certificate_loss(self, batch: Batch, zeta: Tensor, multipliers: Tensor) -> Tensor:
+        return certificate_loss(batch, multipliers, zeta, self.d_min, self.config)
+
+    def update_certificate(self, batch: Batch) -> dict[str, Tensor]:
+        """A projected gradient step on zeta every m_phi updates (Algorithm 1, last line)."""
+        if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
+            return {}
+        with torch.no_grad():
+            multipliers = self.multipliers(batch.observations)
+        zeta = self.zeta.clone().requires_grad_(True)
+        loss = self.certificate_loss(batch, zeta, multipliers)
+        (gradient,) = torch.autograd.grad(loss, [zeta])
+        left = (self.total_updates - self.updates) / (self.total_updates - self._first_update)
+        self.zeta.sub_(gradient, alpha=self._rate * max(left, 0.0))
+        torch.clamp(self.zeta, self._low, self._high, out=self.zeta)
+        sigma, k, n = gradient
+        return {
+            "certificate_loss": loss.detach(),
+            "certificate_grad_norm": gradient.norm(),
+            "certificate_grad_sigma": sigma,
+            "certificate_grad_k": k,
+            "certificate_grad_n": n,
+        }
+
+
+class Trainer(fac.Trainer):
+    agent_type = Agent

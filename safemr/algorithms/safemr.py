@@ -1,0 +1,57 @@
+"""SafeMR: JointSIS plus magnitude regularization of the energy function (the paper's method).
+
+| equation of the paper | function |
+|---|---|
+| a (sigma + d_min)^n + b k (sisadd) | `safemr.energy.magnitude` |
+| certificate loss (SL2add) | `certificate_loss` |
+
+With a = b = 0 this is JointSIS, number for number. Deviations: those of `joint_sis` and `fac`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from safemr import energy
+from safemr.algorithms import joint_sis
+from safemr.buffers import Batch
+from safemr.errors import UserError
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Config(joint_sis.Config):
+    """JointSIS's hyperparameters and the weights of the magnitude term."""
+
+    a: float = 0.35  # weight of (sigma + d_min)^n
+    b: float = 0.15  # weight of k
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("a", "b"):
+            if not getattr(self, name) >= 0:
+                raise UserError(f"{name} = {getattr(self, name)!r} must not be negative")
+
+
+def certificate_loss(
+    batch: Batch, multipliers: Tensor, zeta: Tensor, d_min: float, config: Config
+) -> Tensor:
+    """E[lambda(s) (phi(s') - max(phi(s) - eta_D, 0))] + a (sigma + d_min)^n + b k (Eq. SL2add)."""
+    sigma, k, n = zeta.unbind()
+    data = joint_sis.certificate_loss(batch, multipliers, zeta, d_min, config)
+    scaled_d_min = d_min / config.length_scale
+    return data + energy.magnitude(scaled_d_min, sigma, k, n, config.a, config.b)
+
+
+class Agent(joint_sis.Agent):
+    config: Config
+
+    def certificate_loss(self, batch: Batch, zeta: Tensor, multipliers: Tensor) -> Tensor:
+        return certificate_loss(batch, multipliers, zeta, self.d_min, self.config)
+
+
+class Trainer(joint_sis.Trainer):
+    agent_type = Agent

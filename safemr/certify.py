@@ -1,0 +1,295 @@
+"""Check an energy function: `safemr certify` (`python -m safemr.certify`).
+
+Three questions, kept apart: does the analytic condition (*) hold (four verdicts,
+`safemr.feasibility`); does a dense search find states without a safe action
+(`safemr.falsification`); and does a trained policy pick violating actions although safe ones exist.
+The certificate is given by its parameters, by a run record, or, with neither, is each one that the
+paper prints.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from safemr import falsification, reference
+from safemr.errors import UserError
+from safemr.feasibility import BRAKINGS, CONVENTIONS, analytic_condition
+from safemr.reference import Zeta
+from safemr.tables import Table
+
+DEFAULT_TASK = "Pillars-0.15-Goal"
+DEFAULT_STATES = 2**16
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A named energy function; `policy` is the record folder of a policy trained with it."""
+
+    name: str
+    zeta: Zeta
+    eta: float = 0.0
+    policy: Path | None = None
+
+
+def paper_certificates() -> list[Certificate]:
+    """The three learned sets of Table II, phi_h and phi_0."""
+    learned = [
+        Certificate(f"paper [{a:g}, {b:g}]", zeta) for (a, b), zeta in reference.TABLE_II.items()
+    ]
+    return [
+        *learned,
+        Certificate("phi_h", reference.PHI_H),
+        Certificate("phi_0", reference.PHI_0),
+    ]
+
+
+def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any]]:
+    """The certificate a run ended with, its task, and the task's settings.
+
+    Raises UserError where the record has no policy, or none of the energy-function family.
+    """
+    # Imported here for torch and numba, which parameters alone do not need.
+    from safemr.aircraft import in_metres
+    from safemr.policies import load_policy
+
+    policy = load_policy(folder)
+    if "zeta" not in policy.extras:
+        raise UserError(f"{folder}: its algorithm has no energy function to certify")
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    scale = float(policy.extras.get("length_scale", 1.0))
+    zeta = Zeta(*in_metres([float(value) for value in policy.extras["zeta"]], scale))
+    eta = float(config["algorithm"]["hyperparameters"].get("eta", 0.0)) * scale**zeta.n
+    name = f"{folder.parent.name} {folder.name.split('-')[0]}"
+    task = config["task"]
+    return Certificate(name, zeta, eta, folder), task["name"], dict(task.get("settings", {}))
+
+
+def certify(
+    certificate: Certificate,
+    task: str = DEFAULT_TASK,
+    *,
+    states: int = DEFAULT_STATES,
+    seed: int = 0,
+    settings: Mapping[str, Any] | None = None,
+) -> tuple[dict[str, Any], falsification.Falsification]:
+    """One row of the certificate table, and the search behind it.
+
+    The row: certificate, task, sigma, k, n, eta, the margins of the four analytic verdicts [m/s^2],
+    states searched, infeasible and leak share, worst margin, verdicts shared by the simulator, and,
+    with a policy, its violating and avoidable shares.
+    """
+    zeta, eta = certificate.zeta, certificate.eta
+    envs = falsification.make_simulator(task)
+    analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
+    search = falsification.falsify(envs, zeta, eta=eta, count=states, seed=seed)
+    envs.close()
+    row: dict[str, Any] = {
+        "certificate": certificate.name, "task": task, **zeta._asdict(), "eta": eta,
+        **{_column(r.convention, r.braking): r.margin for r in analytic.itertuples()},
+        "states": len(search.states), "infeasible_share": search.infeasible_share,
+        "leak_share": search.leak_share, "worst_margin": search.worst_margin,
+        "simulator_agrees": f"{search.confirmed}/{search.examined}",
+    }  # fmt: skip
+    if certificate.policy is not None:
+        from safemr.policies import load_policy
+
+        check = falsification.check_policy(
+            load_policy(certificate.policy), task, zeta, eta=eta, seed=seed, settings=settings
+        )
+        row |= {
+            "policy_steps": check.steps,
+            "policy_violating_share": check.violating_share,
+            "policy_avoidable_share": check.avoidable_share,
+        }
+    return row, search
+
+
+def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """The rows of `certify` as a `Table`."""
+    data = pd.DataFrame(rows)
+    verdicts = {
+        f"C {convention}, {braking}": [
+            f"{'holds' if margin >= 0 else 'fails'} ({margin:+.2f})"
+            for margin in data[_column(convention, braking)]
+        ]
+        for convention in CONVENTIONS
+        for braking in BRAKINGS
+    }
+    display = pd.DataFrame(
+        {
+            "certificate": data["certificate"],
+            "task": data["task"],
+            "[sigma, k, n]": [
+                f"[{r.sigma:.3f}, {r.k:.3f}, {r.n:.3f}]" for r in data.itertuples()
+            ],
+            **verdicts,
+            "infeasible": [_share(share, data["states"][i])
+                           for i, share in enumerate(data["infeasible_share"])],
+            "leaking": [f"{100 * share:.3f}%" for share in data["leak_share"]],
+            "worst margin": [f"{margin:+.4f}" for margin in data["worst_margin"]],
+            "simulator agrees": data["simulator_agrees"],
+        }
+    )  # fmt: skip
+    if "policy_steps" in data:
+        for name, heading in (("violating", "policy violates"), ("avoidable", "avoidably")):
+            shares = data[f"policy_{name}_share"]
+            display[heading] = ["–" if np.isnan(s) else f"{100 * s:.3f}%" for s in shares]
+    caption = (
+        "Certificates. Four verdicts of the analytic condition with the smallest margin in m/s^2 "
+        "(C inside: (sigma + d_min)^n, outside: sigma + d_min^n; the deceleration with the robot "
+        "aligned, or from drag alone); share of searched states without a safe action (infeasible), "
+        "of states with phi <= 0 that every action takes out of the safe set (leaking), and the "
+        "worst best margin found, positive where no action is safe. Shares are uniform over "
+        "distance, bearing, course, speed and turn rate; not every such state can be driven to."
+    )
+    return Table("certificates", caption, data, display)
+
+
+def margin_map(
+    task: str, zeta: Zeta, *, eta: float = 0.0, distances: int = 41, bearings: int = 37
+) -> pd.DataFrame:
+    """Best margin of the least favourable motion at each distance and bearing.
+
+    The maximum over courses within 0.4 rad of the obstacle, three speeds and five turn rates, of
+    the least g over the action grid. Returns distance, bearing, margin; nan where the robot would
+    overlap the obstacle. Positive: from some such motion no action is safe.
+    """
+    envs = falsification.make_simulator(task, 1)
+    robot, d_min = falsification.ROBOT, float(envs.d_min)
+    reach = falsification.largest_distance(zeta, d_min)
+    turn_rates = robot.max_turn_rate * np.linspace(-1, 1, 5)
+    axes = (np.linspace(d_min, reach, distances), np.linspace(0, np.pi, bearings),
+            np.linspace(-0.4, 0.4, 3), robot.max_speed * np.array([0.0, 0.5, 1.0]), turn_rates)  # fmt: skip
+    states = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 5)
+    parts = np.array_split(states, max(1, len(states) // falsification.CHUNK))
+    least = np.concatenate(
+        [falsification.grid_margins(part, d_min, zeta, eta).min(1) for part in parts]
+    )
+    overlap = falsification.overlaps_obstacle(envs, states)
+    envs.close()
+    least[overlap] = np.nan
+    margin = least.reshape(distances * bearings, -1).max(1)
+    places = states.reshape(distances * bearings, -1, 5)[:, 0]
+    return pd.DataFrame({"distance": places[:, 0], "bearing": places[:, 1], "margin": margin})
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`safemr certify`; prints the table and, with --out, writes table, picture and examples."""
+    options = _parser().parse_args(arguments)
+    if options.replay is not None:
+        return _replay(options.replay)
+    jobs = _jobs(options)
+    rows, searches = [], []
+    for certificate, task, settings in jobs:
+        print(f"certifying {certificate.name} on {task} ...", file=sys.stderr)
+        row, search = certify(
+            certificate, task, states=options.states, seed=options.seed, settings=settings
+        )
+        rows.append(row)
+        searches.append(search)
+    table = certificate_table(rows)
+    print(table.markdown())
+    for row, search in zip(rows, searches, strict=True):
+        print(f"worst state of {row['certificate']}: {json.dumps(search.example())}")
+    if options.out is not None:
+        _write(options.out, table, jobs, searches)
+    return 0
+
+
+def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, str, dict[str, Any]]]:
+    """What the command line asks for: (certificate, task, settings) each."""
+    given = (options.sigma, options.k, options.n)
+    if options.record:
+        if any(value is not None for value in given):
+            raise UserError("give either --record or --sigma, --k and --n, not both")
+        return [certificate_of_record(Path(folder)) for folder in options.record]
+    if all(value is None for value in given):
+        named = paper_certificates()
+    elif any(value is None for value in given):
+        raise UserError("--sigma, --k and --n belong together: give all three")
+    else:
+        if min(options.sigma, options.k) < 0 or options.n <= 0:
+            raise UserError("sigma and k must not be negative and n must be positive")
+        named = [Certificate(options.name, Zeta(*given))]
+    return [(Certificate(c.name, c.zeta, options.eta), options.task, {}) for c in named]
+
+
+def _write(
+    folder: Path,
+    table: Table,
+    jobs: Sequence[tuple[Certificate, str, Mapping[str, Any]]],
+    searches: Sequence[falsification.Falsification],
+) -> None:
+    from safemr.plotting import certificate as drawing
+    from safemr.plotting import style
+
+    table.write(folder)
+    examples = {job[0].name: search.example() for job, search in zip(jobs, searches, strict=True)}
+    text = json.dumps(examples, indent=1, sort_keys=True) + "\n"
+    (folder / "examples.json").write_text(text, encoding="utf-8")
+    zetas = {job[0].name: job[0].zeta for job in jobs}
+    first, task, _ = jobs[0]
+    envs = falsification.make_simulator(task, 1)
+    chart = drawing.certificate_check(
+        zetas, float(envs.d_min), margin_map(task, first.zeta, eta=first.eta), first.name
+    )
+    envs.close()
+    style.save(chart, folder / "certificates")
+
+
+def _replay(path: Path) -> int:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        examples = content if "state" not in content else {path.stem: content}
+        results = {name: falsification.replay(example) for name, example in examples.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} holds no example written by --out ({error!r})") from error
+    for name, (actions, g) in results.items():
+        best = int(g.argmin())
+        verdict = "no action is safe" if g[best] >= 0 else "a safe action exists"
+        a0, a1 = actions[best]
+        print(f"{name}: {len(g)} actions, least g = {g[best]:+.6f} at ({a0:.3f}, {a1:.3f}): {verdict}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="safemr certify", description=__doc__)
+    parser.add_argument("--sigma", type=float, help="parameters in metres and seconds")
+    parser.add_argument("--k", type=float)
+    parser.add_argument("--n", type=float)
+    parser.add_argument("--eta", type=float, default=0.0, help="eta_D of the constraint")
+    parser.add_argument("--name", default="given", help="name of --sigma, --k, --n in the table")
+    parser.add_argument("--task", default=DEFAULT_TASK, help=f"default {DEFAULT_TASK}")
+    parser.add_argument("--record", action="append", default=[], metavar="FOLDER",
+                        help="a run record: its certificate, and its policy too")  # fmt: skip
+    parser.add_argument("--states", type=int, default=DEFAULT_STATES,
+                        help="states searched, a power of two")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write table, picture, examples")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="replay examples.json")
+    return parser
+
+
+def _column(convention: str, braking: str) -> str:
+    return f"margin_{convention}_{braking.split()[0]}"
+
+
+def _share(share: float, count: int) -> str:
+    """A share in per cent; none found in `count` states is not zero."""
+    return f"{100 * share:.3f}%" if share else f"none of {count}"
+
+
+if __name__ == "__main__":
+    from safemr.cli import reported_errors
+
+    with reported_errors():
+        sys.exit(main())

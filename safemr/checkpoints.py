@@ -1,0 +1,334 @@
+"""Interrupted runs: lock, checkpoints, and the session that a training program works in.
+
+Everything unfinished lives in ``<results root>/.work/<digest>/``, which no Snakemake rule declares,
+so that a failed or killed job cannot take it away; it is removed when the record is written.
+
+    with RunSession(config, variant, root) as session:
+        if not session.complete:
+            state = session.resume()
+            ...
+            session.record(row)
+            session.maybe_checkpoint(trainer.state_dict)
+            ...
+            session.finish(policy_arrays)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from safemr import provenance, records
+from safemr.errors import UserError
+
+CHECKPOINT, ATTEMPTS, LOCK = "checkpoint.pt", "attempts.jsonl", "lock"
+SHARE = 0.02  # the largest share of the run time that checkpoints may take
+_ARRAY = "ndarray"  # the key that marks an encoded NumPy array
+
+
+class RunLockedError(UserError):
+    """Another live process works on the same run."""
+
+    exit_code = 3
+
+
+class RunLock:
+    """One process a run, by an advisory lock that the kernel drops when its owner dies.
+
+    There is no stale lock to recognise and no process number to mistake for another's, also after
+    SIGKILL, a reboot or in a container. The file's text only says who the owner is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._descriptor: int | None = None
+
+    def acquire(self, *, wait: bool) -> None:
+        """Take the lock; when it is held, wait for its owner to end, or raise RunLockedError."""
+        announced = False
+        while not self._try():
+            owner = self.path.read_text(errors="replace").strip() or "another process"
+            if not wait:
+                raise RunLockedError(
+                    f"{self.path.parent.name} is being trained by {owner}; wait for it or stop it"
+                )
+            if not announced:
+                print(f"waiting for {owner}, which trains the same run", file=sys.stderr)
+                announced = True
+            time.sleep(0.5)
+
+    def _try(self) -> bool:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # The previous owner may have removed the file between our open and our lock.
+            current = os.stat(self.path).st_ino == os.fstat(descriptor).st_ino
+        except (BlockingIOError, FileNotFoundError):
+            current = False
+        if not current:
+            os.close(descriptor)
+            return False
+        os.ftruncate(descriptor, 0)
+        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        self._descriptor = descriptor
+        return True
+
+    def release(self) -> None:
+        """Drop the lock; the file may stay."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+
+def encode(value: Any, where: str = "state") -> Any:
+    """Nested containers of arrays and plain values as what ``torch.load(weights_only=True)`` reads.
+
+    NumPy arrays become tensors that share their memory, under a marking key.
+
+    Raises:
+        TypeError: naming the entry that is neither an array nor a plain value.
+    """
+    if isinstance(value, np.ndarray):
+        return {_ARRAY: torch.from_numpy(np.ascontiguousarray(value)), "shape": list(value.shape)}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {key: encode(item, f"{where}[{key!r}]") for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        items = (encode(item, f"{where}[{index}]") for index, item in enumerate(value))
+        return type(value)(items)
+    if value is None or isinstance(value, (bool, int, float, str, torch.Tensor)):
+        return value
+    raise TypeError(f"{where} is a {type(value).__name__}, which a checkpoint cannot hold")
+
+
+def decode(value: Any) -> Any:
+    """The inverse of `encode`."""
+    if isinstance(value, dict):
+        if value.keys() == {_ARRAY, "shape"}:
+            return value[_ARRAY].numpy().reshape(value["shape"])
+        return {key: decode(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(decode(item) for item in value)
+    return value
+
+
+def save(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a checkpoint as a whole and durably; after a failure the previous one is untouched."""
+    temporary = path.with_suffix(".tmp")
+    try:
+        with open(temporary, "wb") as stream:
+            torch.save(encode(content), stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    records.sync_directory(path.parent)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read what `save` wrote. Only tensors and plain values are accepted, so no code can run."""
+    try:
+        content = decode(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:  # every damage has its own exception inside torch
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"{path} is not a readable checkpoint: {reason}") from error
+    if not isinstance(content, dict):
+        raise UserError(f"{path} is not a checkpoint of a run")
+    return content
+
+
+def read_attempts(work: Path) -> list[dict[str, Any]]:
+    """The attempts at an unfinished run, and how they failed; a torn last line is left out."""
+    events = []
+    for line in (work / ATTEMPTS).read_text().splitlines():
+        with contextlib.suppress(ValueError):
+            events.append(json.loads(line))
+    return events
+
+
+class RunSession(contextlib.AbstractContextManager["RunSession"]):
+    """The life of one training run across interruptions.
+
+    Args:
+        config: The resolved run configuration (`safemr.config`).
+        variant: The label of the run in figures and tables.
+        root: The results root.
+        wait: When another process works on the same run, wait for it instead of failing.
+        die_with_parent: Stop, with a checkpoint, when the parent process (Snakemake) is gone.
+        minimum_interval: Seconds between checkpoints at least; they are rarer where writing one
+            takes long, so that they cost at most 2% of the time.
+
+    Attributes:
+        folder: The record's folder.
+        rows: The progress rows so far.
+        complete: Whether the record was already there, in which case nothing is left to do.
+    """
+
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        variant: str,
+        root: Path,
+        *,
+        wait: bool = False,
+        die_with_parent: bool = False,
+        minimum_interval: float = 60.0,
+    ) -> None:
+        self.config, self.variant = config, variant
+        self.digest = records.config_digest(config)
+        self.folder = root / records.record_path(config, variant)
+        self.work = root / ".work" / self.digest
+        self.rows: list[dict[str, float]] = []
+        self.complete = False
+        self._wait, self._minimum_interval = wait, minimum_interval
+        self._lock = RunLock(self.work / LOCK)
+        self._parent = os.getppid() if die_with_parent else None
+        self._signal: signal.Signals | None = None
+        self._handlers: dict[signal.Signals, Any] = {}
+        self._earlier = {"wall_s": 0.0, "cpu_s": 0.0}
+        self._started = time.monotonic()
+        self._due = self._started + minimum_interval
+
+    def __enter__(self) -> Self:
+        self._lock.acquire(wait=self._wait)
+        self._remove_temporary_files()
+        self.complete = records.is_complete(self.folder)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._handlers[number] = signal.signal(number, self._note_signal)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        if self.complete:
+            shutil.rmtree(self.work, ignore_errors=True)
+        self._lock.release()
+
+    def resume(self) -> dict[str, Any] | None:
+        """The trainer state of the last checkpoint, or None where the run starts from nothing."""
+        content: dict[str, Any] | None = None
+        path = self.work / CHECKPOINT
+        if path.exists():
+            try:
+                content = load(path)
+                self.rows = list(content["rows"])
+                self._earlier = dict(content["elapsed"])
+            except (UserError, KeyError, TypeError, ValueError) as error:
+                content = None
+                print(f"warning: starting again from step 0: {error}", file=sys.stderr)
+        step = int(self.rows[-1]["step"]) if self.rows else 0
+        self._note({"started": provenance.now(), "step": step, **provenance.source_revision()})
+        return content["state"] if content else None
+
+    def fail(self, reason: str) -> None:
+        """Keep why training cannot go on, for `safemr records` to tell."""
+        self._note({"failed": provenance.now(), "reason": reason})
+
+    def elapsed(self) -> dict[str, float]:
+        """Wall and CPU seconds of the run, without what was lost between checkpoint and kill."""
+        return {
+            "wall_s": self._earlier["wall_s"] + time.monotonic() - self._started,
+            "cpu_s": self._earlier["cpu_s"] + time.process_time(),
+        }
+
+    def record(self, row: Mapping[str, float]) -> None:
+        """Append a progress row and mirror all rows to ``.work/<digest>/progress.csv``."""
+        self.rows.append(dict(row))
+        with self._survive_full_disk("progress"):
+            text = records.format_progress(self.rows)
+            records.atomic_write(self.work / records.PROGRESS, text.encode(), durable=False)
+
+    def maybe_checkpoint(self, state: Callable[[], Mapping[str, Any]]) -> None:
+        """Save ``state()`` when one is due or the process was told to stop; in that case exit."""
+        reason = self._reason_to_stop()
+        begun = time.monotonic()
+        if reason is None and begun < self._due:
+            return
+        with self._survive_full_disk("checkpoint"):
+            content = {"rows": self.rows, "elapsed": self.elapsed(), "state": state()}
+            save(self.work / CHECKPOINT, content)
+        ended = time.monotonic()
+        self._due = ended + max(self._minimum_interval, (ended - begun) / SHARE)
+        if reason is not None:
+            step = int(self.rows[-1]["step"]) if self.rows else 0
+            print(f"stopped by {reason} at step {step}; the same command continues here",
+                  file=sys.stderr)  # fmt: skip
+            raise SystemExit(128 + (self._signal or signal.SIGTERM))
+
+    def finish(self, policy: Mapping[str, np.ndarray] | None) -> None:
+        """Write the record, provenance last, and remove everything unfinished."""
+        attempts = read_attempts(self.work)
+        origin = {
+            **provenance.collect(),
+            **{name: round(value, 3) for name, value in self.elapsed().items()},
+            "started": attempts[0]["started"],
+            "finished": provenance.now(),
+            "attempts": [{k: v for k, v in event.items() if k != "run"} for event in attempts],
+        }
+        try:
+            records.write_record(self.folder, self.config, self.variant, self.rows, origin, policy)
+        except OSError as error:
+            raise UserError(
+                f"cannot write the record {self.folder}: {error.strerror}; the last checkpoint is "
+                "kept: make room and repeat the command"
+            ) from error
+        self.complete = True
+
+    def _note(self, event: Mapping[str, Any]) -> None:
+        label = f"{self.variant} {self.config['task']['name']} seed {self.config['seed']}"
+        with open(self.work / ATTEMPTS, "a") as stream:
+            stream.write(json.dumps({"run": label, **event}) + "\n")
+
+    def _reason_to_stop(self) -> str | None:
+        if self._signal is not None:
+            return self._signal.name
+        if self._parent is not None and os.getppid() != self._parent:
+            return "the end of its parent process"
+        return None
+
+    def _note_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._signal is not None:  # the second one means it
+            raise SystemExit(128 + number)
+        self._signal = signal.Signals(number)
+
+    def _remove_temporary_files(self) -> None:
+        for folder in (self.work, self.folder):
+            for leftover in (*folder.glob("*.tmp"), *folder.glob(".*.tmp")):
+                leftover.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _survive_full_disk(self, what: str) -> Iterator[None]:
+        """Turn a failed write into a warning: the previous file is intact and training goes on."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:  # torch reports a full disk as RuntimeError
+            cause = error if isinstance(error, OSError) else error.__context__
+            if not isinstance(cause, OSError):
+                raise
+            print(
+                f"warning: no new {what} in {self.work}: {cause.strerror}; the previous one stays",
+                file=sys.stderr,
+            )

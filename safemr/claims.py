@@ -1,0 +1,539 @@
+"""The paper's claims, judged: one rule a claim, computed from records, written before the runs.
+
+A rule turns the evidence into a `Finding`: our number with its 95% interval, a verdict, and the
+reason. docs/claims.md states the rules in words. Common to all: a verdict needs every run of the
+grid that it speaks about, else it is "inconclusive: runs missing: ..."; an interval that contains
+the threshold is inconclusive; and five seeds support 95% intervals, not corrections for the number
+of claims.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from safemr import reference, statistics
+from safemr.statistics import Estimate
+from safemr.tables import SafetyRule, Table, best_safe_baseline, describe_missing
+
+Verdict = Literal["confirmed", "refuted", "inconclusive"]
+
+COVERS = 0.01  # a certificate covers the true unsafe set if it misses at most this share of it
+GROWTH = 2.0  # "bounded": the last quarter's largest value is at most this many times what came before
+NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything a rule may look at.
+
+    scores: score table of final evaluations (`statistics.final_scores`). progress: tidy table.
+    expected: runs (task, variant, seed) that the configured grid asks for; without it, nothing
+    counts as missing but what a rule needs and cannot find at all. points: variant -> (a, b).
+    aircraft: variant, seed, metric, value with the metrics volume_ratio and missed_share; the
+    handcrafted certificate is the variant FAC-phih. certificates: rows of `certify.certify`.
+    """
+
+    scores: pd.DataFrame
+    progress: pd.DataFrame
+    expected: pd.DataFrame | None = None
+    points: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    aircraft: pd.DataFrame | None = None
+    certificates: pd.DataFrame | None = None
+    rule: SafetyRule = field(default_factory=SafetyRule)
+    tasks: Sequence[str] = reference.TASKS
+
+    def missing(self, pairs: Iterable[tuple[str, str]]) -> str:
+        """What is missing of these (task, variant) pairs, in words; "" if nothing."""
+        runs = self.scores[["task", "variant", "seed"]].drop_duplicates()
+        present = set(zip(runs["task"], runs["variant"], strict=True))
+        texts = []
+        for task, variant in pairs:
+            if self.expected is not None:
+                wanted = self.expected
+                wanted = wanted[(wanted["task"] == task) & (wanted["variant"] == variant)]
+                absent = statistics.missing_runs(wanted, runs)
+                if len(absent):
+                    texts.append(describe_missing(absent))
+                    continue
+            if (task, variant) not in present:
+                texts.append(f"{variant} on {task} (all)")
+        return "; ".join(texts)
+
+    def of(self, task: str, variant: str, metric: str) -> np.ndarray:
+        """[seeds] final scores."""
+        return statistics.scores_of(self.scores, task, variant, metric)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One judged statement: our number, its interval, what follows and why."""
+
+    estimate: Estimate
+    verdict: Verdict
+    reason: str
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim of the paper and the rule that judges it."""
+
+    name: str
+    statement: str  # what the paper says
+    measure: str  # what the estimate is
+    figure: str  # stem of the figure that shows it
+    judge: Callable[[Evidence], Finding]
+
+
+def by_interval(estimate: Estimate, threshold: float, what: str) -> Finding:
+    """Confirmed where the interval is above the threshold, refuted where below, else open."""
+    shown = f"{what} {_text(estimate)}"
+    if np.isnan(estimate.low):
+        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
+    if estimate.low > threshold:
+        return Finding(estimate, "confirmed", shown)
+    if estimate.high < threshold:
+        return Finding(estimate, "refuted", shown)
+    return Finding(estimate, "inconclusive", f"{shown}: the interval contains {threshold:g}")
+
+
+def overall(parts: Mapping[str, Finding]) -> Finding:
+    """All parts must hold: one refuted part refutes, one open part leaves it open.
+
+    The estimate is that of the part that decides; the reason names every part.
+    """
+    rank: dict[Verdict, int] = {"refuted": 0, "inconclusive": 1, "confirmed": 2}
+    deciding = min(parts.values(), key=lambda part: rank[part.verdict])
+    reason = "; ".join(f"{name}: {part.verdict}, {part.reason}" for name, part in parts.items())
+    return Finding(deciding.estimate, deciding.verdict, reason)
+
+
+# --- conservativeness (aircraft) -----------------------------------------------------------------
+
+
+def smaller_than_joint_sis(evidence: Evidence) -> Finding:
+    """Volume of JointSIS's unsafe set minus SafeMR's, in units of the true one: Welch, above 0."""
+    volumes = [_aircraft(evidence, variant, "volume_ratio") for variant in ("JointSIS", "SafeMR")]
+    absent = [v for v, x in zip(("JointSIS", "SafeMR"), volumes, strict=True) if not len(x)]
+    if absent:
+        return _missing(f"aircraft measurements of {' and '.join(absent)}")
+    return by_interval(statistics.difference_interval(*volumes), 0.0, "JointSIS - SafeMR")
+
+
+def covers_true_set(evidence: Evidence) -> Finding:
+    """Missed share of SafeMR: confirmed if its interval is at or below 1%, refuted if above."""
+    missed = _aircraft(evidence, "SafeMR", "missed_share")
+    if not len(missed):
+        return _missing("aircraft measurements of SafeMR")
+    return _at_most(statistics.mean_interval(missed), COVERS, "missed share")
+
+
+def handcrafted_does_not_cover(evidence: Evidence) -> Finding:
+    """Missed share of phi_h, a fixed function without seeds: confirmed if above 1%."""
+    missed = _aircraft(evidence, "FAC-phih", "missed_share")
+    if not len(missed):
+        return _missing("aircraft measurements of phi_h")
+    value = float(missed.mean())
+    verdict: Verdict = "confirmed" if value > COVERS else "refuted"
+    return Finding(Estimate(value, value, value, 1), verdict, f"missed share {value:.3f}, computed")
+
+
+# --- return and safety ---------------------------------------------------------------------------
+
+
+def highest_safe_return(task: str, evidence: Evidence) -> Finding:
+    """SafeMR is safe and its return exceeds the best safe baseline's (Welch interval above 0).
+
+    Refuted where SafeMR is not safe or the interval is below 0. With no safe baseline at all the
+    claim holds as soon as SafeMR is safe.
+    """
+    baselines = reference.BASELINES
+    absent = evidence.missing([(task, v) for v in (reference.METHOD, *baselines)])
+    if absent:
+        return _missing(absent)
+    ours = evidence.of(task, reference.METHOD, "eval_return")
+    if not evidence.rule.is_safe(evidence.scores, task, reference.METHOD):
+        cost = statistics.mean_interval(evidence.of(task, reference.METHOD, evidence.rule.cost))
+        return Finding(cost, "refuted", f"SafeMR is not safe: {_text(cost)} violating steps")
+    best, returns = best_safe_baseline(evidence.scores, task, evidence.rule, baselines)
+    if not best:
+        return Finding(statistics.mean_interval(ours), "confirmed", "no baseline is safe")
+    gap = statistics.difference_interval(ours, returns)
+    return by_interval(gap, 0.0, f"SafeMR - {best}")
+
+
+def zero_violations(evidence: Evidence) -> Finding:
+    """Share of final evaluation episodes without any violation, SafeMR, each task.
+
+    Confirmed if it is 1 in every seed (none observed; not a proof); refuted if its interval ends
+    below 1 or its mean is below the safety rule's share; else open.
+    """
+    absent = evidence.missing([(task, reference.METHOD) for task in evidence.tasks])
+    if absent:
+        return _missing(absent)
+    parts = {}
+    for task in evidence.tasks:
+        shares = evidence.of(task, reference.METHOD, evidence.rule.clean)
+        estimate = statistics.mean_interval(shares)
+        shown = f"clean share {_text(estimate)}"
+        if (shares == 1).all():
+            parts[task] = Finding(estimate, "confirmed", f"{shown}, no violation observed")
+        elif estimate.high < 1 or estimate.mean < evidence.rule.clean_share:
+            parts[task] = Finding(estimate, "refuted", shown)
+        else:
+            parts[task] = Finding(estimate, "inconclusive", f"{shown}: near one, not one")
+    return overall(parts)
+
+
+def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
+    """The algorithm is unsafe on every task, beyond doubt of its interval.
+
+    Confirmed on a task if the interval of its violating steps lies above the tolerance or that of
+    its clean share below the rule's; refuted if it is safe by the rule; else open.
+    """
+    absent = evidence.missing([(task, variant) for task in evidence.tasks])
+    if absent:
+        return _missing(absent)
+    rule, parts = evidence.rule, {}
+    for task in evidence.tasks:
+        cost = statistics.mean_interval(evidence.of(task, variant, rule.cost))
+        clean = statistics.mean_interval(evidence.of(task, variant, rule.clean))
+        shown = f"{_text(cost)} violating steps, clean share {_text(clean)}"
+        if rule.is_safe(evidence.scores, task, variant):
+            parts[task] = Finding(cost, "refuted", f"{shown}: safe")
+        elif cost.low > rule.tolerance or clean.high < rule.clean_share:
+            parts[task] = Finding(cost, "confirmed", shown)
+        else:
+            parts[task] = Finding(cost, "inconclusive", f"{shown}: unsafe on average only")
+    return overall(parts)
+
+
+def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding:
+    """The baseline is safe and SafeMR's return exceeds its (Welch interval above 0).
+
+    On every task, or, with `somewhere` (the paper says "in some of the environments"), on those
+    tasks where the baseline is safe, at least one.
+    """
+    names = (reference.METHOD, variant)
+    absent = evidence.missing([(task, name) for task in evidence.tasks for name in names])
+    if absent:
+        return _missing(absent)
+    parts = {}
+    for task in evidence.tasks:
+        if not evidence.rule.is_safe(evidence.scores, task, variant):
+            if not somewhere:
+                cost = statistics.mean_interval(evidence.of(task, variant, evidence.rule.cost))
+                parts[task] = Finding(cost, "refuted", f"{variant} is not safe: {_text(cost)} steps")
+            continue
+        returns = [evidence.of(task, name, "eval_return") for name in names]
+        gap = statistics.difference_interval(*returns)
+        parts[task] = by_interval(gap, 0.0, f"SafeMR - {variant}")
+    if not parts:
+        return Finding(NOTHING, "refuted", f"{variant} is safe on no task")
+    return overall(parts)
+
+
+# --- the points [a, b] ---------------------------------------------------------------------------
+
+
+def points_beat_joint_sis(evidence: Evidence) -> Finding:
+    """For every [a, b] of Table II: return minus JointSIS's, Welch interval above 0."""
+    task = reference.SENSITIVITY_TASK
+    absent = _missing_points(evidence, (*evidence.points, "JointSIS"))
+    if absent:
+        return _missing(absent)
+    baseline = evidence.of(task, "JointSIS", "eval_return")
+    return overall(
+        {
+            f"[{a:g}, {b:g}]": by_interval(
+                statistics.difference_interval(evidence.of(task, v, "eval_return"), baseline),
+                0.0, "return - JointSIS",
+            )
+            for v, (a, b) in evidence.points.items()
+        }
+    )  # fmt: skip
+
+
+def point_costs_vanish(evidence: Evidence) -> Finding:
+    """For every [a, b]: violating steps of the final policy at most the tolerance, by interval."""
+    absent = _missing_points(evidence, tuple(evidence.points))
+    if absent:
+        return _missing(absent)
+    rule = evidence.rule
+    return overall(
+        {
+            f"[{a:g}, {b:g}]": _at_most(
+                statistics.mean_interval(
+                    evidence.of(reference.SENSITIVITY_TASK, variant, rule.cost)
+                ),
+                rule.tolerance, "violating steps",
+            )
+            for variant, (a, b) in evidence.points.items()
+        }
+    )  # fmt: skip
+
+
+# --- feasibility and convergence -----------------------------------------------------------------
+
+
+def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
+    """No searched state lacks a safe action, for every certificate whose name starts with `prefix`.
+
+    Feasible means that the safe action set is nonempty at every state, so one replayable state
+    without a safe action refutes it; a search that finds none leaves it unrefuted, and then the
+    analytic condition with the aligned brake must hold too. The estimate is the largest infeasible
+    share; it has no sampling interval, the states are a fixed low-discrepancy set.
+    """
+    rows = evidence.certificates
+    if rows is not None:
+        rows = rows[rows["certificate"].str.startswith(prefix)]
+    if rows is None or rows.empty:
+        return _missing(f"certify results of {prefix} ...")
+    worst = rows.loc[rows["worst_margin"].idxmax()]
+    share = float(rows["infeasible_share"].max())
+    estimate = Estimate(share, np.nan, np.nan, len(rows))
+    aligned = rows[["margin_inside_aligned", "margin_outside_aligned"]].to_numpy()
+    drag = rows[["margin_inside_drag", "margin_outside_drag"]].to_numpy()
+    shown = (
+        f"{len(rows)} certificates; infeasible share up to {100 * share:.3f}% of searched states; "
+        f"analytic condition holds for {(aligned >= 0).all(1).sum()} with the aligned brake and for "
+        f"{(drag >= 0).all(1).sum()} with drag only"
+    )
+    if worst["worst_margin"] >= 0:
+        found = f"{shown}; {worst['certificate']} has a state whose best margin is "
+        return Finding(estimate, "refuted", f"{found}{worst['worst_margin']:+.4f}")
+    verdict: Verdict = "confirmed" if (aligned >= 0).all() else "inconclusive"
+    return Finding(estimate, verdict, f"{shown}; no infeasible state found")
+
+
+def certificate_settles_last(evidence: Evidence) -> Finding:
+    """Share of training at which zeta settles, minus that of return and mean multiplier.
+
+    A curve has settled where it stays within a tenth of its range of its final value, after a
+    trailing average over a tenth of its points. One number a SafeMR run: the last of sigma, k, n
+    minus the last of the other two. Interval above 0.
+    """
+    late = ("sigma", "k", "n")
+    runs = _curves(evidence, (*late, "train_return", "multiplier_mean"))
+    if not runs:
+        return _missing("SafeMR on any task")
+    lags = []
+    for curves in runs:
+        settled = {
+            metric: statistics.settling_share(steps, values)
+            for metric, (steps, values) in curves.items()
+        }
+        others = [settled[metric] for metric in settled if metric not in late]
+        own = [settled[metric] for metric in late if metric in settled]
+        if own and others:
+            lags.append(max(own) - max(others))
+    return by_interval(statistics.mean_interval(np.array(lags)), 0.0, "settling lag")
+
+
+def losses_bounded(evidence: Evidence) -> Finding:
+    """Largest |value| in the last quarter over that in the rest, every loss and gradient norm.
+
+    One number a SafeMR run, its worst metric. Confirmed if the interval ends at or below 2;
+    refuted if it begins above, or if any value is not finite.
+    """
+    names = evidence.progress.loc[evidence.progress["variant"] == reference.METHOD, "metric"]
+    metrics = [m for m in names.unique() if m.endswith(("_loss", "_grad_norm"))]
+    runs = _curves(evidence, metrics)
+    if not runs:
+        return _missing("losses and gradient norms of SafeMR")
+    ratios = []
+    for curves in runs:
+        worst = 0.0
+        for steps, values in curves.values():
+            if not np.isfinite(values).all():
+                return Finding(NOTHING, "refuted", "a loss or gradient norm is not finite")
+            late = steps > 0.75 * steps[-1]
+            early = np.abs(values[~late]).max(initial=0.0)
+            worst = max(worst, float(np.abs(values[late]).max() / max(early, 1e-12)))
+        ratios.append(worst)
+    return _at_most(statistics.mean_interval(np.array(ratios)), GROWTH, "growth")
+
+
+# --- the list ------------------------------------------------------------------------------------
+
+
+def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
+    """Every claim of the paper that the repository judges, in the paper's order."""
+    listed = [
+        Claim(
+            "conservativeness", "The unsafe set learned by SafeMR is smaller than JointSIS's",
+            "difference of volumes, in units of the true unsafe set", "aircraft",
+            smaller_than_joint_sis,
+        ),
+        Claim(
+            "coverage", "SafeMR's unsafe set covers the true unsafe set",
+            "share of the true unsafe set beyond the collision disc that is missed", "aircraft",
+            covers_true_set,
+        ),
+        Claim(
+            "handcrafted_coverage", "The handcrafted unsafe set does not cover the true one",
+            "share of the true unsafe set beyond the collision disc that is missed", "aircraft",
+            handcrafted_does_not_cover,
+        ),
+    ]  # fmt: skip
+    listed += [
+        Claim(
+            f"highest_return[{task}]",
+            f"SafeMR has the highest return among safe algorithms on {task}",
+            "difference of final returns to the best safe baseline", "training_curves",
+            partial(highest_safe_return, task),
+        )
+        for task in tasks
+    ]  # fmt: skip
+    listed.append(
+        Claim(
+            "zero_violations", "SafeMR has zero constraint violations",
+            "share of final evaluation episodes without violation", "training_curves",
+            zero_violations,
+        )
+    )  # fmt: skip
+    listed += [
+        Claim(
+            f"unsafe[{variant}]", f"{variant} is not safe at cost limit zero",
+            "violating steps an episode, the task that decides", "return_against_cost",
+            partial(unsafe_everywhere, variant),
+        )
+        for variant in (*reference.CMDP_BASELINES, "FAC-phi0")
+    ]  # fmt: skip
+    listed += [
+        Claim(
+            f"safe_but_lower[{variant}]",
+            f"{variant} is safe{where} but has lower return than SafeMR",
+            "difference of final returns, the task that decides", "return_against_cost",
+            partial(safe_but_lower, variant, bool(where)),
+        )
+        for variant, where in (("JointSIS", ""), ("FAC-phih", " in some of the environments"))
+    ]  # fmt: skip
+    return [
+        *listed,
+        Claim(
+            "sensitivity_return", "All choices of [a, b] outperform JointSIS",
+            "difference of final returns, the [a, b] that decides", "sensitivity",
+            points_beat_joint_sis,
+        ),
+        Claim(
+            "sensitivity_cost", "The costs converge to zero for all [a, b]",
+            "violating steps an episode, the [a, b] that decides", "sensitivity",
+            point_costs_vanish,
+        ),
+        Claim(
+            "feasibility_paper", "All three sets of learned parameters are feasible (the paper's)",
+            "largest share of searched states without a safe action", "certificates",
+            partial(parameters_feasible, "paper"),
+        ),
+        Claim(
+            "feasibility_ours", "All learned parameters are feasible (SafeMR's, learned here)",
+            "largest share of searched states without a safe action", "certificates",
+            partial(parameters_feasible, reference.METHOD),
+        ),
+        Claim(
+            "slowest_certificate", "The energy function converges the most slowly",
+            "share of training by which zeta settles later than return and multiplier",
+            "parameters", certificate_settles_last,
+        ),
+        Claim(
+            "bounded", "The loss and the gradient norm do not increase much and cause no divergence",
+            "largest value in the last quarter over the largest before", "parameters",
+            losses_bounded,
+        ),
+    ]  # fmt: skip
+
+
+def claims_table(evidence: Evidence) -> Table:
+    """Statement, measure, our number with its interval, verdict, reason and figure, a row a claim."""
+    rows = []
+    for claim in claims(evidence.tasks):
+        finding = claim.judge(evidence)
+        rows.append([claim.name, claim.statement, claim.measure, *finding.estimate,
+                     finding.verdict, finding.reason, claim.figure])  # fmt: skip
+    data = pd.DataFrame(
+        rows,
+        columns=["claim", "statement", "measure", "estimate", "low", "high", "count",
+                 "verdict", "reason", "figure"],
+    )  # fmt: skip
+    display = pd.DataFrame(
+        {
+            "paper's statement": data["statement"],
+            "our measure": data["measure"],
+            "ours [95% interval]": [_text(Estimate(r.estimate, r.low, r.high, r.count))
+                                    for r in data.itertuples()],
+            "verdict": data["verdict"],
+            "why": data["reason"],
+            "figure": data["figure"],
+        }
+    )  # fmt: skip
+    caption = (
+        "Claims of the paper and what these runs say of them, by rules fixed before the reported "
+        f"seeds were run (docs/claims.md). {str(evidence.rule).capitalize()}."
+    )
+    return Table("claims", caption, data, display)
+
+
+def _at_most(estimate: Estimate, bound: float, what: str) -> Finding:
+    """Confirmed where the whole interval is at or below the bound, refuted where it is above."""
+    shown = f"{what} {_text(estimate)}"
+    if np.isnan(estimate.low):
+        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
+    if estimate.high <= bound:
+        return Finding(estimate, "confirmed", shown)
+    if estimate.low > bound:
+        return Finding(estimate, "refuted", shown)
+    return Finding(estimate, "inconclusive", f"{shown}: the interval contains {bound:g}")
+
+
+def _missing(what: str) -> Finding:
+    return Finding(NOTHING, "inconclusive", f"runs missing: {what}")
+
+
+def _missing_points(evidence: Evidence, variants: Sequence[str]) -> str:
+    unknown = [p for p in reference.TABLE_II if p not in evidence.points.values()]
+    texts = [f"SafeMR with [a, b] = [{a:g}, {b:g}]" for a, b in unknown]
+    texts.append(evidence.missing((reference.SENSITIVITY_TASK, v) for v in variants))
+    return "; ".join(text for text in texts if text)
+
+
+def _aircraft(evidence: Evidence, variant: str, metric: str) -> np.ndarray:
+    table = evidence.aircraft
+    if table is None:
+        return np.empty(0)
+    chosen = table[(table["variant"] == variant) & (table["metric"] == metric)]
+    return chosen["value"].to_numpy(float)
+
+
+def _curves(
+    evidence: Evidence, metrics: Sequence[str]
+) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Of each SafeMR run: metric -> steps and values, a trailing average over a tenth of the log."""
+    progress = evidence.progress
+    chosen = progress[
+        (progress["variant"] == reference.METHOD)
+        & progress["metric"].isin(list(metrics))
+        & progress["task"].isin(list(evidence.tasks))
+    ].dropna(subset=["value"])
+    runs = []
+    for _, run in chosen.groupby(["task", "seed"]):
+        curves = {}
+        for metric, curve in run.sort_values("step").groupby("metric"):
+            window = max(1, len(curve) // 10)
+            smooth = curve["value"].rolling(window, min_periods=1).mean().to_numpy(float)
+            curves[str(metric)] = (curve["step"].to_numpy(float), smooth)
+        runs.append(curves)
+    return runs
+
+
+def _text(estimate: Estimate) -> str:
+    if np.isnan(estimate.mean):
+        return "–"
+    if np.isnan(estimate.low) or estimate.low == estimate.high:
+        return f"{estimate.mean:.3g}"
+    return f"{estimate.mean:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]"

@@ -1,0 +1,407 @@
+"""The configuration file: what may be written in it, and clear errors for everything else.
+
+`load` reads ``config/config.yaml`` (and what ``--configfile`` and ``--config`` put over it) into a
+`Config`: structure, types and ranges. Names of tasks, algorithms and hyperparameters are checked
+where they are resolved into runs, in `safemr.runs`. Nothing here imports torch or an environment.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from safemr.errors import UserError
+
+FAMILIES = ("off_policy", "on_policy")
+WANDB_MODES = ("disabled", "offline", "online")
+LARGEST_SEED = 2**31 - 1
+LARGEST_COUNT = 10**10
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
+_ROOT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+_SOURCES = {"benchmarks", "config", "docs", "envs", "profiles", "safemr", "tests", "workflow"}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One entry of ``algorithms``: a module of `safemr.algorithms` and what differs from it."""
+
+    algorithm: str
+    overrides: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Outside:
+    """An implementation outside `safemr` whose own rule writes the records."""
+
+    algorithm: str
+    version: int
+    steps: int
+    hyperparameters: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class TaskOverrides:
+    """What differs on one task, for all algorithms of a family alike."""
+
+    settings: Mapping[str, Any]
+    budget: Mapping[str, int]
+    hyperparameters: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Points [a, b] of one variant's regularizer on one task."""
+
+    task: str
+    variant: str
+    points: tuple[tuple[float, float], ...]
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Aircraft:
+    """The aircraft experiment: its own learners and seeds."""
+
+    task: str
+    algorithms: Mapping[str, Variant]
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The deterministic evaluation: how often in a run, how many episodes, which first seed."""
+
+    points: int
+    episodes: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Config:
+    """A validated configuration; see config/config.yaml for the meaning of each key."""
+
+    tasks: tuple[str, ...]
+    algorithms: Mapping[str, Variant]
+    seeds: tuple[int, ...]
+    budget: Mapping[str, int]
+    log_points: int
+    evaluation: Evaluation
+    task_overrides: Mapping[str, TaskOverrides]
+    sensitivity: Sensitivity | None
+    aircraft: Aircraft | None
+    outside: Mapping[str, Outside]
+    results_root: Path
+    figures_root: Path
+    wandb_mode: str
+    wandb_project: str
+    cost_tolerance: float
+    zero_violation_share: float
+
+
+def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None) -> Config:
+    """Read configuration files and command-line overrides.
+
+    A later source replaces whole top-level keys of the earlier ones: what a file says about
+    ``algorithms`` is all there is, and what it does not mention stays.
+
+    Raises:
+        UserError: for the first fault, naming it and, for a misspelt name, the nearest valid one.
+    """
+    merged: dict[str, Any] = {}
+    for path in files:
+        merged |= read_yaml(Path(path))
+    return parse(merged | dict(overrides or {}))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The top-level mapping of a YAML file; duplicate keys are errors, 1e-3 is a number."""
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8"), _StrictLoader)
+    except OSError as error:
+        raise UserError(f"cannot read the config file {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
+        where = f"{path}, line {mark.line + 1}" if mark else f"{path}"
+        raise UserError(f"{where}: {problem}") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise UserError(f"{path} must hold a mapping, not {show(content)}")
+    return content
+
+
+def parse(raw: Any) -> Config:
+    """Check structure, types and ranges of a configuration and return it."""
+    top = _Section(raw, "the config", _TOP_LEVEL)
+    evaluation = _Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
+    wandb = _Section(top.get("wandb", {}), "wandb", ("mode", "project"))
+    safe = _Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
+    mode = wandb.get("mode", "disabled")
+    if mode not in WANDB_MODES:
+        raise unknown("wandb mode", mode, WANDB_MODES)
+    config = Config(
+        tasks=_names(top.required("tasks"), "tasks"),
+        algorithms=_variants(top.required("algorithms"), "algorithms"),
+        seeds=_seeds(top.required("seeds"), "seeds"),
+        budget=_budget(top.required("budget"), "budget"),
+        log_points=_integer(top.get("log_points", 50), "log_points", 1),
+        evaluation=Evaluation(
+            _integer(evaluation.required("points"), "evaluation.points", 1),
+            _integer(evaluation.required("episodes"), "evaluation.episodes", 1),
+            _integer(evaluation.get("seed", 10_000), "evaluation.seed", 0, LARGEST_SEED),
+        ),
+        task_overrides={
+            name: _task_overrides(value, f"task_overrides.{name}")
+            for name, value in _labelled(top.get("task_overrides", {}), "task_overrides")
+        },
+        sensitivity=_sensitivity(top.get("sensitivity"), top.required("seeds")),
+        aircraft=_aircraft(top.get("aircraft"), top.required("seeds")),
+        outside={
+            label: _outside(value, f"outside.{label}")
+            for label, value in _labelled(top.get("outside", {}), "outside")
+        },
+        results_root=_root(top.get("results_root", "results"), "results_root"),
+        figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
+        wandb_mode=mode,
+        wandb_project=_name(wandb.get("project", "safemr"), "wandb.project"),
+        cost_tolerance=_number(safe.get("cost_tolerance", 1.0), "safe.cost_tolerance", 0, math.inf),
+        zero_violation_share=_number(
+            safe.get("zero_violation_share", 0.95), "safe.zero_violation_share", 0, 1
+        ),
+    )
+    if config.log_points % config.evaluation.points:
+        raise UserError(
+            f"log_points = {config.log_points} must be a multiple of evaluation.points = "
+            f"{config.evaluation.points}"
+        )
+    clash = sorted(config.algorithms.keys() & config.outside.keys())
+    if clash:
+        raise UserError(f"{clash[0]!r} stands both in algorithms and in outside; rename one")
+    if config.sensitivity and config.sensitivity.variant not in config.algorithms:
+        raise unknown("sensitivity.algorithm", config.sensitivity.variant, config.algorithms)
+    return config
+
+
+def unknown(kind: str, name: Any, known: Iterable[str], where: str = "") -> UserError:
+    """The error for a name that does not exist, with the nearest one that does."""
+    names = sorted(known)
+    close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
+    listing = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+    remedy = f"did you mean {close[0]!r}?" if close else f"there is {listing or 'none'}"
+    return UserError(f"unknown {kind} {show(name)}{' in ' + where if where else ''}; {remedy}")
+
+
+def show(value: Any) -> str:
+    """A short one-line picture of any value for an error message."""
+    text = ascii(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML without duplicate keys, and with 1e-3 as a number (YAML 1.1 reads it as text)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if key.tag != "tag:yaml.org,2002:merge" and key.value.__hash__ and key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {show(key.value)} stands twice", key.start_mark
+                )
+            if isinstance(key.value, str):
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
+_TOP_LEVEL = (
+    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
+    *("sensitivity", "aircraft", "outside", "results_root", "figures_root", "wandb", "safe"),
+)
+
+
+class _Section:
+    """A mapping with a fixed set of keys."""
+
+    def __init__(self, value: Any, where: str, known: Collection[str]) -> None:
+        self.where = where
+        self.value = _mapping(value, where)
+        for key in self.value:
+            if key not in known:
+                raise unknown("key", key, known, where)
+
+    def required(self, key: str) -> Any:
+        if key not in self.value:
+            raise UserError(f"{self.where} lacks {key!r}")
+        return self.value[key]
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return self.value.get(key, default)
+
+
+def _mapping(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise UserError(f"{where} must be a mapping, not {show(value)}")
+    for key in value:
+        if not isinstance(key, str):
+            raise UserError(f"{where}: the key {show(key)} must be text; put it in quotes")
+    return value
+
+
+def _labelled(value: Any, where: str) -> list[tuple[str, Any]]:
+    items = [
+        (_name(key, f"a name in {where}"), item) for key, item in _mapping(value, where).items()
+    ]
+    _distinct([key.lower() for key, _ in items], where)
+    return items
+
+
+def _list(value: Any, where: str) -> list[Any]:
+    if not isinstance(value, (list, tuple)):
+        raise UserError(f"{where} must be a list, not {show(value)}")
+    if not value:
+        raise UserError(f"{where} is empty")
+    return list(value)
+
+
+def _distinct(items: Sequence[Any], where: str) -> None:
+    for index, item in enumerate(items):
+        if item in items[:index]:
+            raise UserError(f"{where} names {show(item)} twice")
+
+
+def _name(value: Any, where: str) -> str:
+    if not isinstance(value, str) or not _NAME.fullmatch(value):
+        raise UserError(
+            f"{where} must consist of letters, digits and . _ + - (60 at most, not beginning with "
+            f"a sign), not {show(value)}"
+        )
+    return value
+
+
+def _names(value: Any, where: str) -> tuple[str, ...]:
+    names = tuple(_name(item, f"each of {where}") for item in _list(value, where))
+    _distinct(names, where)
+    return names
+
+
+def _integer(value: Any, where: str, low: int, high: int = LARGEST_COUNT) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise UserError(f"{where} must be an integer, not {show(value)}")
+    if not low <= value <= high:
+        raise UserError(f"{where} = {show(value)} must lie in [{low}, {high}]")
+    return value
+
+
+def _number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise UserError(f"{where} must be a number, not {show(value)}")
+    if not low <= value <= high or not abs(value) < 1e300:
+        raise UserError(f"{where} = {show(value)} must be finite and lie in [{low:g}, {high:g}]")
+    return float(value)
+
+
+def _seeds(value: Any, where: str) -> tuple[int, ...]:
+    items = _list(value, where)
+    seeds = tuple(_integer(item, f"each of {where}", 0, LARGEST_SEED) for item in items)
+    _distinct(seeds, where)
+    return seeds
+
+
+def _budget(value: Any, where: str) -> dict[str, int]:
+    budget = _Section(value, where, FAMILIES).value
+    return {name: _integer(steps, f"{where}.{name}", 1) for name, steps in budget.items()}
+
+
+def _variants(value: Any, where: str) -> dict[str, Variant]:
+    variants = {}
+    for label, entry in _labelled(value, where):
+        settings = dict(_mapping(entry, f"{where}.{label}"))
+        if "algorithm" not in settings:
+            near = difflib.get_close_matches("algorithm", settings, n=1)
+            hint = f"; did you mean it by {near[0]!r}?" if near else ""
+            raise UserError(f"{where}.{label} lacks 'algorithm'{hint}")
+        variants[label] = Variant(
+            _name(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
+        )
+    if not variants:
+        raise UserError(f"{where} is empty")
+    return variants
+
+
+def _task_overrides(value: Any, where: str) -> TaskOverrides:
+    section = _Section(value, where, ("settings", "budget", "hyperparameters"))
+    families = _Section(section.get("hyperparameters", {}), f"{where}.hyperparameters", FAMILIES)
+    return TaskOverrides(
+        _mapping(section.get("settings", {}), f"{where}.settings"),
+        _budget(section.get("budget", {}), f"{where}.budget"),
+        {
+            family: _mapping(values, f"{where}.hyperparameters.{family}")
+            for family, values in families.value.items()
+        },
+    )
+
+
+def _sensitivity(value: Any, seeds: Any) -> Sensitivity | None:
+    if not value and (value is None or isinstance(value, Mapping)):
+        return None
+    section = _Section(value, "sensitivity", ("task", "algorithm", "points", "seeds"))
+    points = []
+    for point in _list(section.required("points"), "sensitivity.points"):
+        if not isinstance(point, (list, tuple)) or len(point) != 2:
+            raise UserError(f"each of sensitivity.points must be a pair [a, b], not {show(point)}")
+        a, b = (_number(x, "each number of sensitivity.points", 0) for x in point)
+        points.append((a, b))
+    _distinct(points, "sensitivity.points")
+    return Sensitivity(
+        _name(section.required("task"), "sensitivity.task"),
+        _name(section.required("algorithm"), "sensitivity.algorithm"),
+        tuple(points),
+        _seeds(section.get("seeds", seeds), "sensitivity.seeds"),
+    )
+
+
+def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
+    if not value and (value is None or isinstance(value, Mapping)):
+        return None
+    section = _Section(value, "aircraft", ("task", "algorithms", "seeds"))
+    return Aircraft(
+        _name(section.get("task", "Aircraft"), "aircraft.task"),
+        _variants(section.required("algorithms"), "aircraft.algorithms"),
+        _seeds(section.get("seeds", seeds), "aircraft.seeds"),
+    )
+
+
+def _outside(value: Any, where: str) -> Outside:
+    section = _Section(value, where, ("algorithm", "version", "steps", "hyperparameters"))
+    return Outside(
+        _name(section.required("algorithm"), f"{where}.algorithm"),
+        _integer(section.get("version", 1), f"{where}.version", 1),
+        _integer(section.required("steps"), f"{where}.steps", 1),
+        _mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),
+    )
+
+
+def _root(value: Any, where: str) -> Path:
+    if not isinstance(value, str) or not _ROOT.fullmatch(value):
+        raise UserError(
+            f"{where} must be a relative path of plain names (no '..', no hidden folder), "
+            f"not {show(value)}"
+        )
+    if Path(value).parts[0] in _SOURCES:
+        raise UserError(f"{where} = {value!r} lies among the sources; choose another folder")
+    if Path(value).exists() and not Path(value).is_dir():
+        raise UserError(f"{where} = {value!r} is a file; choose a folder")
+    return Path(value)

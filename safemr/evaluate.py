@@ -1,0 +1,33 @@
+"""Evaluation of a policy on fixed seeds, the same for every algorithm."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safemr.episodes import EpisodeStatistics
+
+
+class Acts(Protocol):
+    """Anything that maps raw observations [N, obs] to actions [N, A]."""
+
+    def act(self, observations: NDArray[Any], deterministic: bool = True) -> NDArray[Any]: ...
+
+
+def evaluate(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> dict[str, float]:
+    """One episode in every sub-environment of ``envs``, which are reset with seed, seed + 1, ...
+
+    Returns the averages of `EpisodeStatistics` over these episodes. Reusing ``envs`` from one
+    evaluation to the next gives the same layouts each time.
+    """
+    statistics = EpisodeStatistics(envs.num_envs)
+    running = np.ones(envs.num_envs, bool)
+    observations, _ = envs.reset(seed=seed)
+    while running.any():
+        actions = policy.act(observations, deterministic)
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        statistics.update(rewards, terminated, truncated, infos, counted=running)
+        running &= ~(terminated | truncated)
+    return statistics.pop()

@@ -1,0 +1,164 @@
+"""Quantities against environment steps: training curves, sensitivity, parameters of the energy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from safemr.plotting import style
+
+# One hue for SafeMR everywhere; the [a, b] points differ in lightness and dash.
+_POINT_SHADES = (("#D55E00", "-"), ("#7A2E00", (0, (4, 1.5))), ("#F2A36B", (0, (1, 1.2))))
+
+
+def draw_curves(
+    curves: pd.DataFrame,
+    ax: Axes,
+    *,
+    looks: Mapping[str, tuple[str, object]] | None = None,
+) -> Axes:
+    """Mean lines with shaded intervals; curves: variant, step, mean, low, high (one task)."""
+    for variant in style.ordered(curves["variant"].unique()):
+        run = curves[curves["variant"] == variant]
+        default = (style.colour(variant), style.line_style(variant))
+        tint, line = (looks or {}).get(variant, default)
+        ax.plot(run["step"], run["mean"], color=tint, ls=line, zorder=3)
+        ax.fill_between(run["step"], run["low"], run["high"], color=tint, alpha=0.15, lw=0)
+    ax.margins(x=0)
+    return ax
+
+
+def cost_axis(ax: Axes) -> None:
+    """Costs are linear up to 1 and logarithmic above, so that 0, 0.1 and 100 can all be read."""
+    ax.set_yscale("symlog", linthresh=1.0, linscale=0.8)
+    top = max(ax.get_ylim()[1], 1.0)
+    ax.set_ylim(-0.08, top)
+    ax.set_yticks([tick for tick in (0, 1, 10, 100, 1000) if tick <= top])
+    ax.set_yticks([], minor=True)
+    ax.yaxis.set_major_formatter("{x:g}")
+
+
+@style.styled
+def training_curves(
+    returns: pd.DataFrame, costs: pd.DataFrame, tasks: Sequence[str], *, cost_name: str = "cost"
+) -> Figure:
+    """Fig. "major": expected return above, expected cost below, one column a task, one legend.
+
+    returns, costs: `statistics.learning_curves` of the same runs. A task without runs keeps its
+    panels, which then say so.
+    """
+    figure = style.new_figure(style.TEXT_WIDTH, 3.3)
+    axes = figure.subplots(2, len(tasks), sharex="col", squeeze=False)
+    for column, task in enumerate(tasks):
+        for ax, table in zip(axes[:, column], (returns, costs), strict=True):
+            _task_panel(table, task, ax)
+        axes[0, column].set_title(task)
+        cost_axis(axes[1, column])
+        style.thousands(axes[1, column])
+    axes[0, 0].set_ylabel("expected return")
+    axes[1, 0].set_ylabel(f"expected {cost_name}")
+    _legend(figure, style.ordered(returns["variant"].unique()))
+    return figure
+
+
+@style.styled
+def sensitivity(
+    returns: pd.DataFrame,
+    costs: pd.DataFrame,
+    points: Mapping[str, tuple[float, float]],
+    *,
+    baseline: str = "JointSIS",
+    cost_name: str = "cost",
+) -> Figure:
+    """Fig. "sensitive": return and cost for each [a, b] and for the baseline without regularizer.
+
+    returns, costs: learning curves of one task. points: variant -> (a, b).
+    """
+    looks = {
+        variant: _POINT_SHADES[index % len(_POINT_SHADES)] for index, variant in enumerate(points)
+    }
+    names = {variant: f"SafeMR, $[a, b]=[{a:g}, {b:g}]$" for variant, (a, b) in points.items()}
+    wanted = [*points, baseline]
+    figure = style.new_figure(0.8 * style.TEXT_WIDTH, 2.3)
+    axes = figure.subplots(1, 2)
+    for ax, table, name in zip(axes, (returns, costs), ("return", cost_name), strict=True):
+        chosen = table[table["variant"].isin(wanted)]
+        draw_curves(chosen, ax, looks=looks)
+        _say_missing(ax, [v for v in wanted if v not in set(chosen["variant"])])
+        ax.set_ylabel(f"expected {name}")
+        style.thousands(ax)
+    cost_axis(axes[1])
+    looks[baseline] = (style.colour(baseline), style.line_style(baseline))
+    names[baseline] = style.label(baseline)
+    handles = [Line2D([], [], color=looks[v][0], ls=looks[v][1]) for v in wanted]  # type: ignore[arg-type]
+    figure.legend(handles, [names[v] for v in wanted], loc="outside lower center", ncols=2)
+    return figure
+
+
+@style.styled
+def parameter_evolution(
+    progress: pd.DataFrame,
+    tasks: Sequence[str],
+    *,
+    variants: Sequence[str] = ("SafeMR", "JointSIS"),
+    fixed: Mapping[str, Mapping[str, float]] | None = None,
+) -> Figure:
+    """sigma, k and n during training: one thin line a seed, the mean bold; one row a task.
+
+    progress: tidy table. fixed: variant -> {"sigma": .., "k": .., "n": ..} drawn as level lines.
+    """
+    names = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
+    figure = style.new_figure(style.TEXT_WIDTH, 0.7 + 1.25 * len(tasks))
+    axes = figure.subplots(len(tasks), 3, sharex="row", squeeze=False)
+    for row, task in zip(axes, tasks, strict=True):
+        for ax, (metric, symbol) in zip(row, names.items(), strict=True):
+            chosen = progress[(progress["task"] == task) & (progress["metric"] == metric)]
+            for variant in variants:
+                _seed_lines(chosen[chosen["variant"] == variant], ax, style.colour(variant))
+            for variant, zeta in (fixed or {}).items():
+                ax.axhline(zeta[metric], color=style.colour(variant), ls=style.line_style(variant))
+            ax.set_ylabel(symbol, rotation=0, labelpad=6)
+            ax.margins(x=0)
+            style.thousands(ax)
+        row[0].set_title(task, loc="left")
+        for ax in row[1:]:
+            ax.set_title(" ", loc="left")
+        for ax in row:
+            if row is not axes[-1]:
+                ax.set_xlabel("")
+    _legend(figure, [*variants, *(fixed or {})])
+    return figure
+
+
+def _task_panel(table: pd.DataFrame, task: str, ax: Axes) -> None:
+    chosen = table[table["task"] == task]
+    if chosen.empty:
+        _say_missing(ax, ["all runs"])
+    draw_curves(chosen, ax)
+
+
+def _say_missing(ax: Axes, what: Sequence[str]) -> None:
+    if what:
+        text = "no record: " + ", ".join(what)
+        ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", color="0.5", style="italic")
+
+
+def _seed_lines(runs: pd.DataFrame, ax: Axes, tint: str) -> None:
+    for _, run in runs.groupby("seed"):
+        run = run.sort_values("step")
+        ax.plot(run["step"], run["value"], color=tint, lw=0.5, alpha=0.6)
+    mean = runs.groupby("step")["value"].agg(["mean", "count"])
+    complete = mean[mean["count"] == runs["seed"].nunique()]
+    ax.plot(complete.index, complete["mean"], color=tint, lw=1.4)
+
+
+def _legend(figure: Figure, variants: Sequence[str]) -> None:
+    handles = [
+        Line2D([], [], color=style.colour(v), ls=style.line_style(v), label=style.label(v))
+        for v in variants
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 8))

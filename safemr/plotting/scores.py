@@ -1,0 +1,120 @@
+"""Final scores: return against cost, performance profiles, probability of improvement."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from safemr.plotting import style
+from safemr.statistics import Estimate
+
+
+def draw_return_against_cost(
+    points: pd.DataFrame, ax: Axes, *, tolerance: float | None = None
+) -> Axes:
+    """One small marker a seed, the mean over seeds large; points: variant, seed, cost, value."""
+    if tolerance is not None:
+        ax.axvspan(-1, tolerance, color="#009E73", alpha=0.08, lw=0, zorder=0)
+    for variant in style.ordered(points["variant"].unique()):
+        run = points[points["variant"] == variant]
+        look = {"color": style.colour(variant), "marker": style.marker(variant), "ls": "none"}
+        ax.plot(run["cost"], run["return"], ms=2.6, alpha=0.55, mew=0, **look)
+        ax.plot(run["cost"].mean(), run["return"].mean(), ms=6, mec="white", mew=0.6, **look)
+    ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
+    right = max(1.6 * points["cost"].max(), 10.0) if len(points) else 10.0
+    ax.set_xlim(-0.12, right)
+    ax.set_xticks([tick for tick in (0, 1, 10, 100, 1000) if tick <= right])
+    ax.set_xticks([], minor=True)
+    ax.xaxis.set_major_formatter("{x:g}")
+    return ax
+
+
+@style.styled
+def return_against_cost(
+    scores: pd.DataFrame,
+    tasks: Sequence[str],
+    *,
+    cost: str = "eval_cost_indicator",
+    cost_name: str = "violating steps an episode",
+    tolerance: float | None = None,
+) -> Figure:
+    """Return against cost of the final policies, one panel a task; the safe region is shaded."""
+    wide = scores[scores["metric"].isin(["eval_return", cost])].pivot_table(
+        index=["task", "variant", "seed"], columns="metric", values="value"
+    )
+    wide = wide.rename(columns={"eval_return": "return", cost: "cost"}).reset_index()
+    figure = style.new_figure(style.TEXT_WIDTH, 2.1)
+    axes = figure.subplots(1, len(tasks), squeeze=False)[0]
+    for ax, task in zip(axes, tasks, strict=True):
+        draw_return_against_cost(wide[wide["task"] == task], ax, tolerance=tolerance)
+        ax.set_title(task)
+        ax.set_xlabel(cost_name)
+    axes[0].set_ylabel("final return")
+    handles = [
+        Line2D([], [], color=style.colour(v), marker=style.marker(v), ls="none", ms=4,
+               label=style.label(v))
+        for v in style.ordered(wide["variant"].unique())
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=8)
+    return figure
+
+
+def draw_profiles(profiles: Mapping[str, pd.DataFrame], ax: Axes) -> Axes:
+    """Share of runs above a normalised score; profiles: variant -> threshold, mean, low, high."""
+    for variant in style.ordered(profiles):
+        profile, tint = profiles[variant], style.colour(variant)
+        ax.plot(profile["threshold"], profile["mean"], color=tint, ls=style.line_style(variant))
+        ax.fill_between(profile["threshold"], profile["low"], profile["high"],
+                        color=tint, alpha=0.12, lw=0)  # fmt: skip
+    ax.set_ylim(-0.02, 1.02)
+    ax.margins(x=0)
+    ax.set_ylabel(r"share of runs with score $> \tau$")
+    return ax
+
+
+def draw_intervals(estimates: Mapping[str, Estimate], ax: Axes, *, neutral: float) -> Axes:
+    """Horizontal point-and-interval plot, one row a variant, with a line at the neutral value."""
+    variants = [variant for variant in style.ordered(estimates)][::-1]
+    ax.axvline(neutral, color=style.INK, lw=0.7, ls=(0, (3, 2)))
+    for row, variant in enumerate(variants):
+        mean, low, high, _ = estimates[variant]
+        tint = style.colour(variant)
+        ax.plot([low, high], [row, row], color=tint, lw=3.2, alpha=0.35, solid_capstyle="butt")
+        ax.plot(mean, row, marker=style.marker(variant), color=tint, ms=5, mec="white", mew=0.5)
+    ax.set_yticks(range(len(variants)), [style.label(variant) for variant in variants])
+    ax.set_ylim(-0.6, len(variants) - 0.4)
+    ax.grid(axis="y", visible=False)
+    ax.tick_params(axis="y", length=0)
+    return ax
+
+
+@style.styled
+def aggregate_scores(
+    profiles: Mapping[str, pd.DataFrame],
+    iqm: Mapping[str, Estimate],
+    improvement: Mapping[str, Estimate],
+    *,
+    method: str = "SafeMR",
+) -> Figure:
+    """Profiles over all tasks, IQM of the normalised return, probability of improvement."""
+    figure = style.new_figure(style.TEXT_WIDTH, 2.3)
+    left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
+    draw_profiles(profiles, left)
+    left.set_xlabel(r"normalised return $\tau$ (paper's SafeMR $= 1$)")
+    draw_intervals(iqm, middle, neutral=1.0)
+    middle.set_xlabel("IQM of normalised return")
+    draw_intervals(improvement, right, neutral=0.5)
+    right.set_xlim(-0.03, 1.03)
+    right.set_xlabel(rf"$P$({style.label(method)} $>$ baseline)")
+    for letter, ax in zip("abc", (left, middle, right), strict=True):
+        style.panel_letter(ax, letter)
+    handles = [
+        Line2D([], [], color=style.colour(v), ls=style.line_style(v), label=style.label(v))
+        for v in style.ordered(profiles)
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=8)
+    return figure

@@ -1,0 +1,8 @@
+"""The true unsafe set of the aircraft encounter: solver, analytic barrier, grid-free bound."""
+
+from __future__ import annotations
+
+from safemr.reachability.grid import Grid
+from safemr.reachability.solver import ADVERSARIAL, CASES, CONSTANT, Solution, load_or_solve, solve
+
+__all__ = ["ADVERSARIAL", "CASES", "CONSTANT", "Grid", "Solution", "load_or_solve", "solve"]

@@ -1,0 +1,123 @@
+"""On-policy storage and generalised advantage estimation (Schulman et al., arXiv:1506.02438).
+
+A rollout is T steps of N environments that restart by themselves (Gymnasium's SAME_STEP): where an
+episode ends at step t, the observation stored for t + 1 belongs to the next episode, and the
+observation in which the episode ended arrives apart. Values are therefore bootstrapped from that
+final observation where the episode was truncated, from nothing where it terminated, and from the
+stored successor everywhere else, the cut at the end of the rollout included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def gae(
+    rewards: np.ndarray,
+    values: np.ndarray,
+    next_values: np.ndarray,
+    ended: np.ndarray,
+    gamma: float,
+    lam: float,
+) -> np.ndarray:
+    """A_t = delta_t + gamma lam A_{t+1}, delta_t = r_t + gamma V(s_{t+1}) - V(s_t); all [T, N].
+
+    ``ended`` (bool) marks the last step of an episode: the sum stops there. ``next_values`` holds
+    V of the state reached by each step, 0 where it was terminal. With lam = 1, A + V is the
+    discounted return of the episode, bootstrapped where it was cut.
+    """
+    advantages = rewards + gamma * next_values - values
+    decay = gamma * lam * ~ended
+    for t in range(len(advantages) - 2, -1, -1):
+        advantages[t] += decay[t] * advantages[t + 1]
+    return advantages
+
+
+class Rollout:
+    """T steps of N environments; rewards and costs share every array as signals 0 and 1."""
+
+    def __init__(self, steps: int, num_envs: int, observation_dim: int, action_dim: int) -> None:
+        self.observations = torch.zeros(steps + 1, num_envs, observation_dim)
+        self.actions = torch.zeros(steps, num_envs, action_dim)
+        self.signals = np.zeros((2, steps, num_envs))
+        self.terminated = np.zeros((steps, num_envs), dtype=bool)
+        self.truncated = np.zeros((steps, num_envs), dtype=bool)
+        self._finals: list[tuple[int, int, Tensor]] = []
+        self.length = 0
+
+    def clear(self) -> None:
+        """Starts the next rollout in the same memory."""
+        self.length = 0
+        self._finals.clear()
+
+    def add(
+        self,
+        observations: Tensor,
+        actions: Tensor,
+        rewards: np.ndarray,
+        costs: np.ndarray,
+        terminated: np.ndarray,
+        truncated: np.ndarray,
+        final_observations: Tensor | None,
+    ) -> None:
+        """One step of all N environments.
+
+        observations [N, D] are those acted on; final_observations [N, D] is needed where
+        ``terminated | truncated`` [N] holds somewhere, and read only there.
+        """
+        t = self.length
+        self.observations[t] = observations
+        self.actions[t] = actions
+        self.signals[0, t] = rewards
+        self.signals[1, t] = costs
+        self.terminated[t] = terminated
+        self.truncated[t] = truncated
+        self.length += 1
+        if final_observations is not None:
+            for i in np.flatnonzero(truncated & ~terminated):
+                self._finals.append((t, int(i), final_observations[i].clone()))
+
+    def close(self, observations: Tensor) -> None:
+        """Stores the observations [N, D] that follow the last step."""
+        self.observations[self.length] = observations
+
+    @property
+    def ended(self) -> np.ndarray:
+        """Where an episode ended [T, N]."""
+        return self.terminated | self.truncated
+
+    def values(self, critics: Callable[[Tensor], Tensor]) -> tuple[np.ndarray, np.ndarray]:
+        """V(s_t) and V of the state reached by step t, each [2, T, N] in float64.
+
+        ``critics`` maps observations [B, D] to [2, B, 1]: expected reward and cost.
+        """
+        steps, num_envs = self.terminated.shape
+        rows = [self.observations.flatten(0, 1)]
+        if self._finals:
+            rows.append(torch.stack([observation for _, _, observation in self._finals]))
+        with torch.no_grad():
+            outputs = critics(torch.cat(rows)).squeeze(-1).double().numpy()
+        stored = outputs[:, : (steps + 1) * num_envs].reshape(2, steps + 1, num_envs)
+        following = stored[:, 1:].copy()
+        following[:, self.terminated] = 0.0
+        for row, (t, i, _) in enumerate(self._finals, start=(steps + 1) * num_envs):
+            following[:, t, i] = outputs[:, row]
+        return stored[:, :-1], following
+
+
+def minibatches(size: int, batch: int, generator: torch.Generator) -> Iterator[Tensor | slice]:
+    """One pass over ``size`` samples in random batches; a single whole one when batch >= size.
+
+    A remainder smaller than half a batch is dropped from this pass, so that no step is taken on a
+    handful of samples.
+    """
+    if batch >= size:
+        yield slice(None)
+        return
+    for indices in torch.randperm(size, generator=generator).split(batch):
+        if 2 * len(indices) >= batch:
+            yield indices

@@ -1,0 +1,385 @@
+"""The tables of the paper and beyond: score tables -> `Table` -> CSV, Markdown and LaTeX.
+
+A `Table` keeps the numbers (written as CSV at full precision) and the strings a reader sees
+(Markdown, LaTeX); both come from one DataFrame. Runs that a table needs and does not have are
+listed in its notes, and a row without any run says "missing".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from safemr import reference, statistics
+from safemr.statistics import Estimate
+
+MISSING = "missing"
+ABSENT = "–"
+
+# Columns of the full results: metric of the deterministic evaluation -> heading.
+RESULT_METRICS = {
+    "eval_return": "return",
+    "eval_cost": "cost",
+    "eval_cost_indicator": "violating steps",
+    "eval_cost_contact": "any contact",
+    "eval_zero_violation_share": "clean episodes",
+    "eval_violation_rate": "violation rate",
+    "eval_goals": "goals",
+    "minutes": "minutes",
+}
+REWARD_PARTS = {
+    "eval_return": "return",
+    "eval_reward_approach": "approach",
+    "eval_reward_push": "push",
+    "eval_reward_goal": "goal bonus",
+    "eval_goals": "goals",
+}
+
+
+@dataclass(frozen=True)
+class SafetyRule:
+    """When an algorithm counts as safe on a task, from the final evaluations of its seeds.
+
+    Violating steps (info["cost_indicator"], an episode has 1,000 steps) mean the same on every
+    task, whereas the authors' cost is a contact count on one and a depth on the other.
+    """
+
+    tolerance: float = 1.0  # mean violating steps an episode, at most
+    clean_share: float = 0.95  # mean share of episodes without any violation, at least
+    cost: str = "eval_cost_indicator"
+    clean: str = "eval_zero_violation_share"
+
+    def is_safe(self, scores: pd.DataFrame, task: str, variant: str) -> bool | None:
+        """True or False by the mean over seeds, or None where there is no such run."""
+        cost = statistics.scores_of(scores, task, variant, self.cost)
+        clean = statistics.scores_of(scores, task, variant, self.clean)
+        if not len(cost) or not len(clean):
+            return None
+        return bool(cost.mean() <= self.tolerance and clean.mean() >= self.clean_share)
+
+    def __str__(self) -> str:
+        return (
+            f"safe: over the seeds, final evaluations have on average at most {self.tolerance:g} "
+            f"violating step(s) an episode and at least {100 * self.clean_share:g}% of episodes "
+            "without any violation"
+        )
+
+
+@dataclass(frozen=True)
+class Table:
+    """A finished table: `data` holds the numbers, `display` what is printed."""
+
+    name: str
+    caption: str
+    data: pd.DataFrame
+    display: pd.DataFrame
+    notes: Sequence[str] = field(default_factory=tuple)
+
+    def markdown(self) -> str:
+        """GitHub Markdown: caption, table, notes."""
+        head, *body = _cells(self.display)
+        lines = [f"**{self.caption}**", "", _row(head), _row(["---"] * len(head))]
+        lines += [_row([cell.replace("|", "\\|") for cell in row]) for row in body]
+        return "\n".join([*lines, *(f"\n{note}" for note in self.notes)]) + "\n"
+
+    def latex(self) -> str:
+        """A LaTeX table environment (booktabs), caption and notes included."""
+        head, *body = [[_latex(cell) for cell in row] for row in _cells(self.display)]
+        rows = [" & ".join(row) + r" \\" for row in body]
+        caption = _latex(" ".join([self.caption, *self.notes]))
+        return "\n".join(
+            [r"\begin{table*}", r"\centering", rf"\caption{{{caption}}}",
+             rf"\label{{tab:{self.name}}}", rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}",
+             r"\toprule", " & ".join(head) + r" \\", r"\midrule", *rows, r"\bottomrule",
+             r"\end{tabular}", r"\end{table*}"]
+        ) + "\n"  # fmt: skip
+
+    def write(self, folder: Path | str) -> tuple[Path, Path, Path]:
+        """Write <folder>/<name>.csv, .md and .tex; returns the three paths."""
+        stem = Path(folder) / self.name
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        paths = tuple(stem.with_name(f"{self.name}.{end}") for end in ("csv", "md", "tex"))
+        self.data.to_csv(paths[0], index=False, lineterminator="\n")
+        paths[1].write_text(self.markdown(), encoding="utf-8")
+        paths[2].write_text(self.latex(), encoding="utf-8")
+        return paths[0], paths[1], paths[2]
+
+
+# --- the tables ----------------------------------------------------------------------------------
+
+
+def table_one(
+    scores: pd.DataFrame,
+    *,
+    missing: pd.DataFrame | None = None,
+    rule: SafetyRule | None = None,
+    tasks: Sequence[str] = reference.TASKS,
+    baselines: Sequence[str] = reference.BASELINES,
+) -> Table:
+    """Table I: return of SafeMR, of the best safe baseline, and the improvement, beside the paper's.
+
+    scores: a score table (`statistics.final_scores`). missing: runs of the grid that have no
+    record (`statistics.missing_runs`). The best baseline is chosen on the same runs that it is
+    compared with, which favours the baseline slightly and is said in the caption.
+    """
+    rule = rule or SafetyRule()
+    rows = [_table_one_row(scores, task, rule, baselines) for task in tasks]
+    data = pd.DataFrame(rows)
+    lines: dict[str, list[str]] = {
+        "SafeMR": [
+            _plus_minus(r["safemr"], r["safemr_low"], r["safemr_high"], 2)
+            + ("" if r["safemr_safe"] in (True, None) else " (not safe)")
+            for r in rows
+        ],
+        "Highest among safe baselines": [
+            _plus_minus(r["baseline_return"], r["baseline_low"], r["baseline_high"], 2)
+            + (f" ({r['baseline']})" if r["baseline"] else "")
+            for r in rows
+        ],
+        "Improvement [95% interval]": [
+            _percent(r["improvement"], r["improvement_low"], r["improvement_high"]) for r in rows
+        ],
+        "Paper: SafeMR": [_number(r["paper_safemr"], 3) for r in rows],
+        "Paper: highest among safe": [_number(r["paper_baseline"], 3) for r in rows],
+        "Paper: improvement, printed": [f"{r['paper_printed']:.1f}%" for r in rows],
+        "Paper: improvement, recomputed": [f"{r['paper_recomputed']:.1f}%" for r in rows],
+    }
+    display = pd.DataFrame(
+        [[name, *cells] for name, cells in lines.items()], columns=["Expected return", *tasks]
+    )
+    caption = (
+        "Table I. Efficiency of SafeMR against the best safe baseline: final return of the "
+        "deterministic policy, mean over seeds with the half width of its 95% t interval; "
+        f"improvement with Fieller's 95% interval. {str(rule).capitalize()}. The best baseline is "
+        "chosen on the runs it is compared with."
+    )
+    return Table("table1", caption, data, display, _notes(missing, tasks, None))
+
+
+def full_results(
+    scores: pd.DataFrame,
+    *,
+    missing: pd.DataFrame | None = None,
+    rule: SafetyRule | None = None,
+    metrics: Mapping[str, str] = RESULT_METRICS,
+    name: str = "results",
+) -> Table:
+    """Every algorithm on every task; scripted reference lines are ordinary entries of `scores`.
+
+    `data` has one row per (task, variant, metric) with mean, t interval, IQM and its bootstrap
+    interval; the printed cell is "mean ± half width", with the IQM after the return.
+    """
+    rule = rule or SafetyRule()
+    data = statistics.summarise(scores[scores["metric"].isin(list(metrics))])
+    data = data.sort_values("task", key=_task_order, kind="stable").reset_index(drop=True)
+    rows = []
+    for task, variant in _entries(data, missing):
+        chosen = data[(data["task"] == task) & (data["variant"] == variant)].set_index("metric")
+        safe = rule.is_safe(scores, task, variant)
+        cells = [_summary_cell(chosen, metric) for metric in metrics]
+        seeds = str(int(chosen["count"].max())) if len(chosen) else MISSING
+        rows.append([task, variant, seeds, {True: "yes", False: "no", None: ABSENT}[safe], *cells])
+    display = pd.DataFrame(rows, columns=["task", "algorithm", "seeds", "safe", *metrics.values()])
+    caption = (
+        "Full results: final performance of the deterministic policy (mean over the last 10% of "
+        "evaluations), mean over seeds ± half width of the 95% t interval; IQM in brackets. Cost is "
+        "the authors' (pillars: contact steps of the body; hazards: summed depth); any contact "
+        f"counts the robot's nose too. {str(rule).capitalize()}. Scripted controllers see the full "
+        "state and are not learned."
+    )
+    return Table(name, caption, data, display, _notes(missing, None, None))
+
+
+def push_split(scores: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
+    """Push returns split into approach, push and goal bonus, with the scripted lines."""
+    push = scores[scores["task"].str.endswith("Push")]
+    absent = None if missing is None else missing[missing["task"].str.endswith("Push")]
+    table = full_results(push, missing=absent, metrics=REWARD_PARTS, name="push_split")
+    caption = (
+        "Push returns by part: approach is earned by walking to the box, push by bringing the box "
+        "nearer to the goal, the bonus by goals reached. Mean over seeds ± half width of the 95% t "
+        "interval; IQM in brackets. A return near that of touching the box says nothing about "
+        "pushing."
+    )
+    return Table(table.name, caption, table.data, table.display, table.notes)
+
+
+def table_two(
+    final: pd.DataFrame,
+    points: Mapping[str, tuple[float, float]],
+    *,
+    missing: pd.DataFrame | None = None,
+    task: str = reference.SENSITIVITY_TASK,
+) -> Table:
+    """Table II: learned [sigma, k, n] for each [a, b], per seed and mean, beside the paper's.
+
+    final: score table with the last values of sigma, k, n (`statistics.last_values`).
+    points: variant -> (a, b).
+    """
+    rows = []
+    for variant, (a, b) in points.items():
+        zeta = {name: _by_seed(final, task, variant, name) for name in ("sigma", "k", "n")}
+        for seed in sorted(set().union(*(values.index for values in zeta.values()))):
+            rows.append([a, b, variant, str(seed), *(zeta[name][seed] for name in zeta)])
+        means = [statistics.mean_interval(values.to_numpy(float)) for values in zeta.values()]
+        rows.append([a, b, variant, "mean", *(m.mean for m in means)])
+        rows.append([a, b, variant, "half width", *(m.half_width for m in means)])
+        if (a, b) in reference.TABLE_II:
+            rows.append([a, b, variant, "paper", *reference.TABLE_II[(a, b)]])
+    data = pd.DataFrame(rows, columns=["a", "b", "variant", "seed", "sigma", "k", "n"])
+    display = pd.DataFrame(
+        {
+            "[a, b]": [f"[{a:g}, {b:g}]" for a, b in zip(data["a"], data["b"], strict=True)],
+            "seed": data["seed"],
+            **{name: [_number(value, 3) for value in data[name]] for name in ("sigma", "k", "n")},
+        }
+    )
+    caption = (
+        f"Table II. Learned energy-function parameters on {task} for each [a, b]: last value of "
+        "each run, mean and half width of the 95% t interval over seeds, and the paper's."
+    )
+    return Table("table2", caption, data, display, _notes(missing, [task], list(points)))
+
+
+# --- formatting ----------------------------------------------------------------------------------
+
+
+def _table_one_row(
+    scores: pd.DataFrame, task: str, rule: SafetyRule, baselines: Sequence[str]
+) -> dict[str, object]:
+    ours = statistics.scores_of(scores, task, reference.METHOD, "eval_return")
+    best, best_returns = best_safe_baseline(scores, task, rule, baselines)
+    own, other = statistics.mean_interval(ours), statistics.mean_interval(best_returns)
+    gain = statistics.improvement_interval(ours, best_returns)
+    paper = reference.TABLE_I.get(task)
+    return {
+        "task": task,
+        "safemr": own.mean, "safemr_low": own.low, "safemr_high": own.high, "seeds": own.count,
+        "safemr_safe": rule.is_safe(scores, task, reference.METHOD),
+        "baseline": best, "baseline_return": other.mean,
+        "baseline_low": other.low, "baseline_high": other.high, "baseline_seeds": other.count,
+        "improvement": gain.mean, "improvement_low": gain.low, "improvement_high": gain.high,
+        "paper_safemr": paper.safemr if paper else np.nan,
+        "paper_baseline": paper.best_safe if paper else np.nan,
+        "paper_printed": paper.printed_improvement if paper else np.nan,
+        "paper_recomputed": paper.improvement if paper else np.nan,
+    }  # fmt: skip
+
+
+def best_safe_baseline(
+    scores: pd.DataFrame, task: str, rule: SafetyRule, baselines: Sequence[str]
+) -> tuple[str, np.ndarray]:
+    """Name and [seeds] returns of the safe baseline with the highest mean; ("", []) if none is."""
+    best, returns = "", np.empty(0)
+    for variant in baselines:
+        values = statistics.scores_of(scores, task, variant, "eval_return")
+        if rule.is_safe(scores, task, variant) and len(values):
+            if not len(returns) or values.mean() > returns.mean():
+                best, returns = variant, values
+    return best, returns
+
+
+def describe_missing(missing: pd.DataFrame) -> str:
+    """ "SafeMR on Hazards-0.15-Push (seeds 3, 4); ..." from rows (task, variant, seed)."""
+    groups = missing.groupby(["task", "variant"], sort=False)["seed"]
+    return "; ".join(
+        f"{variant} on {task} (seeds {', '.join(map(str, seeds))})"
+        for (task, variant), seeds in groups
+    )
+
+
+def _notes(
+    missing: pd.DataFrame | None, tasks: Sequence[str] | None, variants: Sequence[str] | None
+) -> tuple[str, ...]:
+    if missing is None:
+        return ()
+    if tasks is not None:
+        missing = missing[missing["task"].isin(list(tasks))]
+    if variants is not None:
+        missing = missing[missing["variant"].isin(list(variants))]
+    return (f"Runs missing: {describe_missing(missing)}.",) if len(missing) else ()
+
+
+def _entries(data: pd.DataFrame, missing: pd.DataFrame | None) -> list[tuple[str, str]]:
+    """(task, variant) of every row to print: those with data, then those wholly missing."""
+    pairs = list(dict.fromkeys(zip(data["task"], data["variant"], strict=True)))
+    if missing is not None:
+        absent = zip(missing["task"], missing["variant"], strict=True)
+        pairs += [pair for pair in dict.fromkeys(absent) if pair not in pairs]
+    order = {variant: index for index, variant in enumerate(reference.ALGORITHMS)}
+    tasks = _task_order(pd.Series([task for task, _ in pairs]))
+    ranked = sorted(
+        zip(tasks, pairs, strict=True),
+        key=lambda item: (item[0], order.get(item[1][1], len(order))),
+    )
+    return [pair for _, pair in ranked]
+
+
+def _task_order(tasks: pd.Series) -> pd.Series:
+    order = {task: index for index, task in enumerate(reference.TASKS)}
+    return tasks.map(lambda task: order.get(task, len(order)))
+
+
+def _by_seed(scores: pd.DataFrame, task: str, variant: str, metric: str) -> pd.Series:
+    chosen = scores[
+        (scores["task"] == task) & (scores["variant"] == variant) & (scores["metric"] == metric)
+    ]
+    return chosen.set_index("seed")["value"]
+
+
+def _summary_cell(chosen: pd.DataFrame, metric: str) -> str:
+    if metric not in chosen.index:
+        return ABSENT if len(chosen) else MISSING
+    row = chosen.loc[metric]
+    if metric == "eval_zero_violation_share":
+        return _plus_minus(100 * row["mean"], 100 * row["low"], 100 * row["high"], 1) + "%"
+    cell = _plus_minus(row["mean"], row["low"], row["high"], 4 if metric.endswith("rate") else 2)
+    return f"{cell} [{row['iqm']:.2f}]" if metric == "eval_return" else cell
+
+
+def _plus_minus(mean: object, low: object, high: object, digits: int) -> str:
+    estimate = Estimate(float(mean), float(low), float(high), 0)  # type: ignore[arg-type]
+    if np.isnan(estimate.mean):
+        return MISSING
+    if np.isnan(estimate.half_width):
+        return f"{estimate.mean:.{digits}f}"
+    return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
+
+
+def _percent(mean: object, low: object, high: object) -> str:
+    value, lower, upper = 100 * np.array([mean, low, high], dtype=float)
+    if np.isnan(value):
+        return MISSING
+    if np.isnan(lower):
+        return f"{value:+.1f}%"
+    if np.isinf(lower):
+        return f"{value:+.1f}% [unbounded]"
+    return f"{value:+.1f}% [{lower:+.1f}, {upper:+.1f}]"
+
+
+def _number(value: object, digits: int) -> str:
+    number = float(value)  # type: ignore[arg-type]
+    return MISSING if np.isnan(number) else f"{number:.{digits}f}"
+
+
+def _cells(display: pd.DataFrame) -> list[list[str]]:
+    return [list(map(str, display.columns)), *(list(map(str, row)) for row in display.values)]
+
+
+def _row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "±": r"$\pm$", "–": "--", "%": r"\%", "_": r"\_", "&": r"\&",
+    "#": r"\#", "{": r"\{", "}": r"\}", "<": "$<$", ">": "$>$", "$": r"\$",
+    "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "≥": r"$\geq$", "≤": r"$\leq$",
+}  # fmt: skip
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(character, character) for character in text)

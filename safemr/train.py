@@ -1,0 +1,260 @@
+"""One training run from a resolved configuration to its record.
+
+    python -m safemr.train --task Pillars-0.15-Goal --algorithm safemr --seed 100 --steps 100000
+
+The pipeline calls the same program with ``--resolved`` (the run's configuration as JSON). Whatever
+the algorithm, this file evaluates, records, checkpoints and resumes; the algorithm only trains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+import yaml
+
+from safemr import records, runs
+from safemr.checkpoints import RunSession
+from safemr.errors import UserError
+
+WANDB_MODES = ("disabled", "offline", "online")
+
+
+def make_envs(task: Mapping[str, Any], num_envs: int) -> Any:
+    """A batched environment of a run's task: the ``task`` entry of its config."""
+    import gymnasium as gym
+
+    import envs  # noqa: F401  registers the tasks
+
+    return gym.make_vec(
+        f"{task['name']}-v0",
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        **task["settings"],
+    )
+
+
+class Progress:
+    """What a person sees: a line per log point, redrawn in place on a terminal."""
+
+    def __init__(self, label: str, steps: int, stream: TextIO) -> None:
+        self._label, self._steps, self._stream = label, steps, stream
+
+    def show(self, row: Mapping[str, float]) -> None:
+        def number(name: str, form: str = ".2f") -> str:
+            value = row.get(name, float("nan"))
+            return "-" if value != value else format(value, form)
+
+        share = min(row["step"] / self._steps, 1.0)
+        rate = row["time_steps_per_s"]
+        left = (self._steps - row["step"]) / rate if rate > 0 else 0.0
+        zeta = ""
+        if "sigma" in row:
+            zeta = f" | zeta {number('sigma', '.3f')} {number('k', '.3f')} {number('n', '.3f')}"
+        terminal = self._stream.isatty()
+        bar = "#" * round(20 * share)
+        line = (
+            f"{self._label} "
+            + (f"[{bar:<20}] " if terminal else "")
+            + f"{int(row['step'])}/{self._steps} | {rate:.0f} steps/s | train return "
+            f"{number('train_return')} cost {number('train_cost')} | eval return "
+            f"{number('eval_return')} cost {number('eval_cost')}{zeta} | "
+            f"{int(max(left, 0.0)) // 60}:{int(max(left, 0.0)) % 60:02d} left"
+        )
+        end = "\n" if not terminal or share >= 1.0 else ""
+        self._stream.write(("\r\x1b[K" if terminal else "") + line + end)
+        self._stream.flush()
+
+
+def train(
+    config: Mapping[str, Any],
+    session: RunSession,
+    *,
+    label: str = "",
+    stream: TextIO = sys.stderr,
+    wandb: Mapping[str, str] | None = None,
+) -> None:
+    """Trains inside an open ``session``, continuing from its checkpoint where there is one.
+
+    Raises UserError where the installed code is not the version that ``config`` asks for, and
+    `safemr.training.TrainingDiverged` when a quantity stops being finite.
+    """
+    import torch
+
+    from safemr.evaluate import evaluate
+    from safemr.mirror import Mirror
+
+    # One run is one thread: at these sizes more threads only wait for each other.
+    torch.set_num_threads(1)
+    described = config["algorithm"]
+    algorithm = runs.load_algorithm(described["name"])
+    if algorithm.version != described["version"]:
+        raise UserError(
+            f"the run asks for {described['name']} version {described['version']}, the installed "
+            f"code is version {algorithm.version}: check out the revision that made the record, "
+            "or resolve the configuration anew"
+        )
+    steps, log_every, evaluation = config["steps"], config["log_every"], config["evaluation"]
+    environments = functools.partial(make_envs, config["task"])
+    hyperparameters = algorithm.hyperparameters(**described["hyperparameters"])
+    trainer = algorithm.trainer(hyperparameters, environments, config["seed"], steps)
+    evaluation_envs = environments(evaluation["episodes"])
+    state = session.resume()
+    if state is not None:
+        trainer.load_state_dict(state)
+        print(f"{label} continues at step {trainer.step}", file=stream)
+    progress = Progress(label, steps, stream)
+    with Mirror(config, session, wandb or {}) as mirror:
+        while trainer.step < steps:
+            begun, before = time.perf_counter(), trainer.step
+            metrics = trainer.advance(min((before // log_every + 1) * log_every, steps))
+            trained = time.perf_counter()
+            if trainer.step // evaluation["every"] > before // evaluation["every"]:
+                result = evaluate(trainer.policy, evaluation_envs, evaluation["seed"])
+                metrics |= {f"eval_{name}": value for name, value in result.items()}
+            row = {
+                "step": trainer.step,
+                **metrics,
+                "time_wall_s": session.elapsed()["wall_s"],
+                "time_steps_per_s": (trainer.step - before) / (trained - begun),
+                "time_eval_s": time.perf_counter() - trained,
+            }
+            session.record(row)
+            progress.show(row)
+            mirror.log(row)
+            session.maybe_checkpoint(trainer.state_dict)
+    session.finish(trainer.policy.arrays())
+
+
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m safemr.train", description=__doc__)
+    parser.add_argument("--task", help="for instance Pillars-0.15-Goal")
+    parser.add_argument("--algorithm", help="a file in safemr/algorithms, for instance safemr")
+    parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
+    parser.add_argument("--steps", type=int, default=320_000, help="environment steps")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="override a hyperparameter; task.NAME=VALUE is a setting of the environment",
+    )
+    parser.add_argument("--log-points", type=int, default=20, help="rows of progress.csv")
+    parser.add_argument("--eval-episodes", type=int, default=10)
+    parser.add_argument("--eval-seed", type=int, default=10_000)
+    parser.add_argument(
+        "--resolved", help="a run's complete configuration as JSON, or a file of it"
+    )
+    parser.add_argument("--variant", help="label of the run (default: the algorithm's name)")
+    parser.add_argument(
+        "--out", "--root", dest="root", type=Path, default=Path("results"), help="results root"
+    )
+    parser.add_argument("--wandb", choices=WANDB_MODES, default="disabled")
+    parser.add_argument("--wandb-project", default="safemr")
+    parser.add_argument("--wait", action="store_true", help="wait for another process on this run")
+    parser.add_argument(
+        "--die-with-parent", action="store_true", help="stop when the parent process is gone"
+    )
+    return parser.parse_args(argv)
+
+
+def _override(text: str) -> tuple[str, Any]:
+    name, separator, value = text.partition("=")
+    if not separator or not name:
+        raise UserError(f"--set {text}: write NAME=VALUE")
+    try:
+        return name.strip(), yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise UserError(f"--set {text}: the value is not valid YAML") from error
+
+
+def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
+    """The run's configuration and label from command-line arguments."""
+    if arguments.resolved:
+        text = arguments.resolved
+        try:
+            if not text.lstrip().startswith("{"):
+                text = Path(text).read_text()
+            config = json.loads(text)
+            name = config["algorithm"]["name"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise UserError(f"--resolved {arguments.resolved[:60]}: not a run: {error}") from error
+        return config, arguments.variant or name
+    if not arguments.task or not arguments.algorithm:
+        raise UserError("give --task and --algorithm (or --resolved)")
+    for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
+        if getattr(arguments, name) < (0 if "seed" in name else 1):
+            raise UserError(f"--{name.replace('_', '-')} must be positive")
+    overrides = dict(map(_override, arguments.set))
+    settings = {
+        name.removeprefix("task."): overrides.pop(name)
+        for name in list(overrides)
+        if name.startswith("task.")
+    }
+    algorithm = runs.load_algorithm(arguments.algorithm, "--algorithm")
+    log_every = max(arguments.steps // arguments.log_points, 1)
+    run = runs.make_run(
+        runs.describe_task(arguments.task, settings, "--task"),
+        algorithm,
+        runs.hyperparameters(algorithm, overrides, "--set"),
+        variant=arguments.variant or arguments.algorithm,
+        seed=arguments.seed,
+        steps=arguments.steps,
+        log_every=log_every,
+        evaluation={
+            "every": log_every,
+            "episodes": arguments.eval_episodes,
+            "seed": arguments.eval_seed,
+        },
+    )
+    return json.loads(records.canonical_json(run.config)), run.variant
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit status (2 user error, 3 locked, 4 diverged)."""
+    from safemr.training import TrainingDiverged
+
+    arguments = _parse(argv)
+    try:
+        config, variant = resolve(arguments)
+        label = f"{variant} {config['task']['name']} seed {config['seed']}"
+        with RunSession(
+            config,
+            variant,
+            arguments.root,
+            wait=arguments.wait,
+            die_with_parent=arguments.die_with_parent,
+        ) as session:
+            if session.complete:
+                print(f"{label}: already recorded in {session.folder}", file=sys.stderr)
+                return 0
+            try:
+                train(
+                    config,
+                    session,
+                    label=label,
+                    wandb={"mode": arguments.wandb, "project": arguments.wandb_project},
+                )
+            except TrainingDiverged as error:
+                last = int(session.rows[-1]["step"]) if session.rows else 0
+                print(
+                    f"error: {label}: {error}; last good log point: step {last}; unfinished files "
+                    f"are in {session.work}",
+                    file=sys.stderr,
+                )
+                return 4
+            print(f"{label}: record in {session.folder}", file=sys.stderr)
+            return 0
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return int(getattr(error, "exit_code", 2))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,76 @@
+"""What every training loop offers, so that records, resuming and evaluation exist once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Protocol
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from safemr.policies import Policy
+
+MakeEnvs = Callable[[int], gym.vector.VectorEnv]
+
+
+class TrainingDiverged(RuntimeError):
+    """A quantity of the training became infinite or not a number.
+
+    Attributes: ``step`` (environment steps done), ``quantity`` (its name) and ``value``.
+    """
+
+    def __init__(self, step: int, quantity: str, value: float) -> None:
+        super().__init__(f"{quantity} became {value} at step {step}")
+        self.step, self.quantity, self.value = step, quantity, value
+
+
+class Trainer(Protocol):
+    """A resumable training run of one algorithm with one seed."""
+
+    family: ClassVar[str]
+    step: int
+
+    def __init__(self, config: Any, make_envs: MakeEnvs, seed: int, total_steps: int) -> None: ...
+
+    def advance(self, until: int) -> dict[str, float]:
+        """Trains until at least ``until`` environment steps; returns the interval's metrics.
+
+        Raises TrainingDiverged.
+        """
+        ...
+
+    @property
+    def policy(self) -> Policy: ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue bit for bit: tensors, arrays and plain types only."""
+        ...
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+
+
+def check_finite(step: int, metrics: Mapping[str, float], allowed: tuple[str, ...] = ()) -> None:
+    """Raises TrainingDiverged for the first metric that is not finite.
+
+    Episode statistics (``allowed`` prefixes) are nan in an interval without a finished episode.
+    """
+    for name, value in metrics.items():
+        if not np.isfinite(value) and not name.startswith(allowed or ("train_",)):
+            raise TrainingDiverged(step, name, value)
+
+
+def generator(seed: int, stream: int, device: str = "cpu") -> torch.Generator:
+    """A torch generator for one purpose (``stream``) of a run, independent of all others."""
+    (word,) = np.random.SeedSequence([seed, stream]).generate_state(1, np.uint64)
+    return torch.Generator(device).manual_seed(int(word >> np.uint64(1)))
+
+
+def environment_seed(seed: int) -> int:
+    """Seed of a run's first sub-environment.
+
+    Sub-environment i gets this plus i, so the seeds of neighbouring runs (0, 1, 2, ...) themselves
+    would give them almost the same layouts.
+    """
+    (word,) = np.random.SeedSequence([seed, 4]).generate_state(1)
+    return int(word >> 1)

@@ -1,0 +1,108 @@
+"""The direction of imports, read from the syntax trees of all sources."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = sorted(
+    path.relative_to(ROOT)
+    for package in ("envs", "safemr")
+    for path in (ROOT / package).rglob("*.py")
+)
+ENVIRONMENT_PACKAGES = {"envs", "gymnasium", "mujoco", "numpy", "numba", "matplotlib"}
+# The true dynamics that the reachability solver and the aircraft's tables share with the task.
+MAY_IMPORT_DYNAMICS = "envs.aircraft"
+
+
+def imports(path: Path, *, top_level: bool = False) -> Iterator[str]:
+    """Dotted names that a module imports; with ``top_level`` only those that importing it costs."""
+    tree = ast.parse((ROOT / path).read_text())
+    nodes = list(ast.walk(tree))
+    if top_level:
+        nodes = [inner for node in tree.body if not _deferred(node) for inner in ast.walk(node)]
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _deferred(node: ast.stmt) -> bool:
+    if isinstance(node, ast.If):
+        return ast.unparse(node.test) in ("TYPE_CHECKING", "__name__ == '__main__'")
+    return isinstance(node, (ast.FunctionDef, ast.ClassDef))
+
+
+def reached(start: str) -> set[str]:
+    """Top-level imports of a module of this repository, followed through the repository."""
+    names, todo = set(), [start]
+    while todo:
+        name = todo.pop()
+        if name in names:
+            continue
+        names.add(name)
+        for suffix in (".py", "/__init__.py"):
+            path = Path(name.replace(".", "/") + suffix)
+            if (ROOT / path).is_file():
+                todo += imports(path, top_level=True)
+    return names
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_direction_of_imports(path: Path) -> None:
+    names = set(imports(path))
+    packages = {name.partition(".")[0] for name in names}
+    assert "workflow" not in packages
+    assert "snakemake" not in packages
+    if path.parts[0] == "envs":
+        assert packages <= ENVIRONMENT_PACKAGES | sys.stdlib_module_names
+    else:  # environments come by their Gymnasium id; `import envs` only registers them
+        inside = {name for name in names if name.startswith("envs.")}
+        assert all(name.startswith(MAY_IMPORT_DYNAMICS) for name in inside)
+    if path.parts[:2] == ("safemr", "algorithms"):
+        programs = {f"safemr.{name}" for name in ("cli", "config", "records", "runs", "train")}
+        assert not names & programs
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        *("safemr.config", "safemr.records", "safemr.runs", "safemr.plan_cache", "safemr.cli"),
+        *("safemr.statistics", "safemr.tables"),
+        *(f"safemr.plotting.{path.stem}" for path in (ROOT / "safemr/plotting").glob("[a-z]*.py")),
+    ],
+)
+def test_reading_and_drawing_need_no_torch(module: str) -> None:
+    assert "torch" not in reached(module)
+
+
+def test_building_the_workflow_needs_neither_torch_nor_a_simulator() -> None:
+    names = reached("safemr.plan_cache")
+    assert not names & {"torch", "mujoco", "gymnasium", "numba", "pandas", "matplotlib"}
+
+
+def test_energy_has_one_home() -> None:
+    """Powers of distances minus a multiple of d_dot: phi is written in safemr/energy.py only."""
+
+    def is_phi(node: ast.AST) -> bool:
+        if not isinstance(node, ast.BinOp) or not isinstance(node.op, ast.Sub):
+            return False
+        has_power = any(isinstance(part, ast.Pow) for part in ast.walk(node.left))
+        return has_power and "d_dot" in ast.unparse(node.right)
+
+    trees = {path: ast.parse((ROOT / path).read_text()) for path in SOURCES}
+    homes = {str(path) for path, tree in trees.items() if any(map(is_phi, ast.walk(tree)))}
+    assert homes == {"safemr/energy.py"}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_files_stay_readable(path: Path) -> None:
+    assert len((ROOT / path).read_text().splitlines()) <= 450

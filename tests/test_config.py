@@ -1,0 +1,441 @@
+"""The configuration: what a valid one means, and one clear line for everything else."""
+
+from __future__ import annotations
+
+import copy
+import datetime
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safemr import config, runs
+from safemr.errors import UserError
+from safemr.plan_cache import plan_for
+
+ROOT = Path(__file__).resolve().parents[1]
+DEFAULT = ROOT / "config/config.yaml"
+
+VALID: dict[str, Any] = {
+    "tasks": ["Pillars-0.15-Goal", "Hazards-0.15-Push"],
+    "algorithms": {
+        "SafeMR": {"algorithm": "safemr", "a": 0.35, "b": 0.15},
+        "PPO-L": {"algorithm": "ppo_lagrangian"},
+    },
+    "seeds": [100, 101],
+    "budget": {"off_policy": 1000, "on_policy": 2000},
+    "log_points": 10,
+    "evaluation": {"points": 5, "episodes": 2, "seed": 10000},
+    "task_overrides": {
+        "Hazards-0.15-Push": {
+            "settings": {"sleep": True},
+            "budget": {"off_policy": 3000},
+            "hyperparameters": {"off_policy": {"update_every": 16}},
+        }
+    },
+    "sensitivity": {
+        "task": "Pillars-0.15-Goal",
+        "algorithm": "SafeMR",
+        "points": [[0.35, 0.15], [0.45, 0.15]],
+        "seeds": [100],
+    },
+    "aircraft": {"algorithms": {"JointSIS": {"algorithm": "joint_sis"}}, "seeds": [100]},
+    "outside": {"Script": {"algorithm": "script", "steps": 100, "hyperparameters": {"gain": 1.0}}},
+    "results_root": "results",
+    "figures_root": "paper_figures",
+    "wandb": {"mode": "disabled", "project": "safemr"},
+    "safe": {"cost_tolerance": 1.0, "zero_violation_share": 0.95},
+}
+
+NOT_A_NUMBER = ["1", "1e5", None, [], {}, True, datetime.date(2020, 1, 1)]
+NOT_AN_INTEGER = [*NOT_A_NUMBER, 1.5, math.nan]
+NOT_POSITIVE = [*NOT_AN_INTEGER, 0, -1, 10**30]
+NOT_A_MAPPING = ["text", 3, [1], True, 1.5]
+NOT_A_NAME = [
+    None,
+    3,
+    "",
+    " ",
+    "a b",
+    "../x",
+    "a/b",
+    "-a",
+    "/etc",
+    "Größe",
+    "\u202ex",
+    "x" * 61,
+    "a\nb",
+]
+NOT_A_LIST = [None, 3, "100", {}, {"a": 1}, [], True]
+NOT_A_ROOT = [
+    *(None, 3, [], "", ".", "..", "../up", "a/../b", "/absolute", ".git", "~/home", "a//b", "a b"),
+    *(
+        "safemr",
+        "workflow/x",
+        "tests",
+        "a/./b",
+        "C:\\x",
+        "{wildcard}",
+        "résultats",
+        "$HOME",
+        "a\0b",
+    ),
+]
+
+WRONG: dict[tuple[str, ...], list[Any]] = {
+    ("tasks",): [
+        *NOT_A_LIST,
+        *([name] for name in NOT_A_NAME),
+        *(["Pillars-0.15-Gaol"], ["pillars-0.15-goal"], ["Pillars-0.15-Goal-v0"], ["CartPole"]),
+        ["Pillars-0.15-Goal", "Pillars-0.15-Goal"],
+    ],
+    ("seeds",): [
+        *NOT_A_LIST,
+        *([seed] for seed in [*NOT_AN_INTEGER, -1, 2**31, "seed"]),
+        *([1, 1], [1, 2, 1], [1, "2"]),
+    ],
+    ("algorithms",): [
+        *(None, {}, *NOT_A_MAPPING),
+        *({name: {"algorithm": "fac"}} for name in NOT_A_NAME[2:]),
+        *({"X": value} for value in [None, {}, *NOT_A_MAPPING]),
+        {"X": {"algoritm": "fac"}},
+        *({"X": {"algorithm": name}} for name in [*NOT_A_NAME, "FAC", "safe_mr", "os", "__init__"]),
+        {"A": {"algorithm": "fac"}, "a": {"algorithm": "joint_sis"}},
+        {"A": {"algorithm": "fac"}, "B": {"algorithm": "fac", "n": 2.0}},
+    ],
+    ("algorithms", "SafeMR"): [
+        *({"algorithm": "safemr", "gamma": value} for value in [*NOT_A_NUMBER, math.inf, 2, -0.1]),
+        *({"algorithm": "safemr", "batch_size": value} for value in NOT_POSITIVE[:-1]),
+        *({"algorithm": "safemr", "activation": value} for value in [3, "Elu", None, ["elu"]]),
+        *({"algorithm": "safemr", key: 1} for key in ["gama", "Sigma", "lr", "__class__"]),
+    ],
+    ("budget",): [None, {}, {"off_policy": 1000}, *NOT_A_MAPPING, {"offpolicy": 1000}],
+    ("budget", "off_policy"): [*NOT_POSITIVE, 5],
+    ("log_points",): [*NOT_POSITIVE, 7],
+    ("evaluation",): [None, {}, *NOT_A_MAPPING, {"points": 5}, {"point": 5, "episodes": 2}],
+    ("evaluation", "points"): NOT_POSITIVE,
+    ("evaluation", "episodes"): NOT_POSITIVE,
+    ("evaluation", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("task_overrides",): [
+        *NOT_A_MAPPING,
+        *({name: {}} for name in ["Pillar-0.15-Goal", *NOT_A_NAME[2:]]),
+    ],
+    ("task_overrides", "Hazards-0.15-Push"): [*NOT_A_MAPPING, {"setting": {}}, {"steps": 5}],
+    ("task_overrides", "Hazards-0.15-Push", "settings"): [
+        *NOT_A_MAPPING,
+        *({"sleeep": True}, {"sleep": "yes"}, {"sleep": 1}, {"num_obstacles": 0}, {"name": "x"}),
+        *({"obstacle_size": -1.0}, {"obstacle_size": math.nan}, {"extent": datetime.date.today()}),
+    ],
+    ("task_overrides", "Hazards-0.15-Push", "budget"): [
+        *(*NOT_A_MAPPING, {"off": 1}, {"on_policy": 0}),
+    ],
+    ("task_overrides", "Hazards-0.15-Push", "hyperparameters"): [
+        *NOT_A_MAPPING,
+        *({"off_policy": value} for value in NOT_A_MAPPING),
+        *({"offpolicy": {}}, {"off_policy": {"update_evry": 1}}),
+        {"off_policy": {"update_every": 0}},
+    ],
+    ("sensitivity",): [*NOT_A_MAPPING, {"task": "Pillars-0.15-Goal"}, {"point": [[1, 1]]}],
+    ("sensitivity", "task"): [*NOT_A_NAME, "Pillars"],
+    ("sensitivity", "algorithm"): [*NOT_A_NAME, "safemr", "PPO-L"],
+    ("sensitivity", "points"): [
+        *(*NOT_A_LIST, [1], [[1]], [[1, 2, 3]], [["a", "b"]], [[-1, 0]], [[1, 1]] * 2),
+    ],
+    ("aircraft",): [*NOT_A_MAPPING, {"seeds": [1]}, {"task": "Boat"}],
+    ("aircraft", "algorithms"): [None, {}, *NOT_A_MAPPING, {"X": {"algorithm": "x"}}],
+    ("outside",): [*NOT_A_MAPPING, {"SafeMR": {"algorithm": "x", "steps": 100}}],
+    ("outside", "Script"): [
+        *(None, {}, *NOT_A_MAPPING, {"algorithm": "x"}, {"algorithm": "x", "step": 1}),
+    ],
+    ("outside", "Script", "steps"): [*NOT_POSITIVE, 5],
+    ("outside", "Script", "hyperparameters"): [
+        *NOT_A_MAPPING,
+        *({"x": math.nan}, {"x": datetime.date.today()}, {"x": b"bytes"}, {1: 2}),
+    ],
+    ("results_root",): NOT_A_ROOT,
+    ("figures_root",): NOT_A_ROOT,
+    ("wandb",): [None, *NOT_A_MAPPING, {"modes": "online"}],
+    ("wandb", "mode"): [None, True, "on", "Online", ["online"], 3],
+    ("wandb", "project"): NOT_A_NAME,
+    ("safe", "cost_tolerance"): [*NOT_A_NUMBER, -1, math.nan, math.inf],
+    ("safe", "zero_violation_share"): [*NOT_A_NUMBER, -0.1, 1.1, math.nan],
+    (): [
+        *NOT_A_MAPPING,
+        *({**VALID, key: 1} for key in ["task", "Seeds", "budgets", "", "results", "é", 3, None]),
+        *({k: v for k, v in VALID.items() if k != lost} for lost in list(VALID)[:4]),
+    ],
+}  # fmt: skip
+
+BAD_TEXTS = {
+    "duplicate top-level key": "seeds: [1]\nseeds: [2]\n",
+    "duplicate algorithm": "algorithms:\n  A: {algorithm: fac}\n  A: {algorithm: safemr}\n",
+    "duplicate hyperparameter": "algorithms: {A: {algorithm: fac, n: 1.0, n: 2.0}}\n",
+    "unclosed list": "seeds: [1, 2\n",
+    "tab": "seeds:\n\t- 1\n",
+    "bad indentation": "budget:\n  off_policy: 1\n on_policy: 2\n",
+    "a list": "- tasks\n- seeds\n",
+    "a scalar": "tasks\n",
+    "two documents": "seeds: [1]\n---\nseeds: [2]\n",
+    "python object": "seeds: !!python/object/apply:os.system ['touch hacked']\n",
+    "python name": "seeds: !!python/name:os.system\n",
+    "unknown anchor": "seeds: *nothing\n",
+    "unhashable key": "? [1, 2]\n: 3\n",
+    "recursive": "tasks: &a [*a]\n",
+    "control character": "seeds: [1]\x07\n",
+    "number as key": "3: 4\n",
+    "yes as key": "yes: 4\n",
+}
+
+
+def changed(path: tuple[str, ...], value: Any) -> Any:
+    """VALID with one place replaced."""
+    if not path:
+        return value
+    result = copy.deepcopy(VALID)
+    place = result
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    return result
+
+
+def resolve(raw: Any) -> runs.Plan:
+    return runs.resolve(config.parse(raw))
+
+
+def one_line(error: UserError) -> str:
+    text = str(error)
+    assert text
+    assert text.isascii() or "\n" not in text
+    assert len(text.splitlines()) == 1
+    assert len(text) < 500
+    return text
+
+
+CASES = [(path, value) for path, values in WRONG.items() for value in values]
+
+
+def test_enough_distinct_bad_inputs() -> None:
+    assert len({(path, repr(value)) for path, value in CASES} | {*BAD_TEXTS}) >= 400
+
+
+@pytest.mark.parametrize("path", WRONG, ids=lambda path: ".".join(path) or "top")
+def test_each_bad_value_is_one_clear_line(
+    path: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for value in WRONG[path]:
+        with pytest.raises(UserError) as caught:
+            resolve(changed(path, value))
+        one_line(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", BAD_TEXTS.values(), ids=BAD_TEXTS)
+def test_each_bad_file_is_one_clear_line(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        config.load([DEFAULT, path])
+    one_line(caught.value)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["bad.yaml"]
+
+
+def test_unreadable_files_are_named(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\x00seeds")
+    for path in (tmp_path / "missing.yaml", tmp_path, binary):
+        with pytest.raises(UserError, match=path.name):
+            config.load([path])
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "expected"),
+    [
+        ((), {**VALID, "sedes": [1]}, "unknown key 'sedes' in the config; did you mean 'seeds'?"),
+        (("tasks",), ["Pillars-0.15-Gaol"], "did you mean 'Pillars-0.15-Goal'?"),
+        (("algorithms", "X"), {"algorithm": "safmr"}, "did you mean 'safemr'?"),
+        (("algorithms", "X"), {"algorithm": "fac", "gama": 0.9}, "did you mean 'gamma'?"),
+        (("sensitivity", "algorithm"), "SafeMT", "did you mean 'SafeMR'?"),
+        (("wandb", "mode"), "ofline", "did you mean 'offline'?"),
+        (("task_overrides", "Hazards-0.15-Push", "settings"), {"slep": True}, "'slep'"),
+    ],
+)
+def test_misspelt_names_are_named_with_the_nearest(
+    path: tuple[str, ...], value: Any, expected: str
+) -> None:
+    with pytest.raises(UserError) as caught:
+        resolve(changed(path, value))
+    assert expected in one_line(caught.value)
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(sorted(WRONG)), anything)
+def test_random_values_end_in_a_plan_or_one_line(path: tuple[str, ...], value: Any) -> None:
+    try:
+        plan = resolve(changed(path, value))
+    except UserError as error:
+        one_line(error)
+    else:
+        assert all(".." not in run.path.parts and not run.path.is_absolute() for run in plan.runs)
+
+
+def test_the_grid() -> None:
+    plan = resolve(VALID)
+    assert len(plan.navigation) == 2 * 2 * 2
+    assert len(plan.aircraft) == 1
+    assert len(plan.outside) == 2 * 2
+    assert plan.points == {"SafeMR": (0.35, 0.15), "SafeMR[0.45,0.15]": (0.45, 0.15)}
+    # The first point is the headline variant itself: not a run of its own.
+    assert len(plan.trained) == 8 + 1 + 1
+    push = next(run for run in plan.navigation if run.task == "Hazards-0.15-Push")
+    assert push.config["steps"] == 3000
+    assert push.config["task"]["settings"] == {"sleep": True}
+    assert push.config["algorithm"]["hyperparameters"]["update_every"] == 16
+    assert push.config["log_every"] == 300
+    assert push.config["evaluation"] == {"every": 600, "episodes": 2, "seed": 10000}
+
+
+def test_a_variant_stands_above_the_tuning_of_a_task() -> None:
+    raw = changed(("algorithms", "SafeMR", "update_every"), 4)
+    plan = resolve(raw)
+    values = {
+        run.task: run.config["algorithm"]["hyperparameters"]["update_every"]
+        for run in plan.navigation
+        if run.variant == "SafeMR"
+    }
+    assert set(values.values()) == {4}
+
+
+CHANGES: list[tuple[tuple[str, ...], Any, int]] = [
+    (("seeds",), [100, 102], 4 + 2),  # two tasks x two algorithms, one outside variant on two
+    (("budget", "on_policy"), 2500, 4),
+    (("budget", "off_policy"), 1100, 2 + 1 + 1),  # Pillars, its point, the aircraft
+    (("algorithms", "SafeMR", "gamma"), 0.98, 4 + 1),
+    (("algorithms", "PPO-L", "gamma"), 0.98, 4),
+    (("task_overrides", "Hazards-0.15-Push", "settings", "sleep"), False, 4 + 2),
+    (("sensitivity", "points"), [[0.45, 0.15], [0.5, 0.5]], 1),
+    (("outside", "Script", "version"), 2, 4),
+    (("evaluation", "episodes"), 3, 14),
+    (("wandb", "mode"), "offline", 0),
+    (("safe", "cost_tolerance"), 2.0, 0),
+    (("figures_root",), "elsewhere", 0),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "count"), CHANGES, ids=lambda item: str(item)[:40])
+def test_a_change_makes_exactly_the_runs_it_touches_new(
+    path: tuple[str, ...], value: Any, count: int
+) -> None:
+    before = {run.path for run in resolve(VALID).runs}
+    after = {run.path for run in resolve(changed(path, value)).runs}
+    assert len(before) == 14
+    assert len(after - before) == count
+
+
+def test_equal_settings_have_equal_digests() -> None:
+    spelled_out = changed(("algorithms", "SafeMR", "a"), 0.35)
+    spelled_out["algorithms"]["SafeMR"]["gamma"] = 0.99  # the default
+    spelled_out["algorithms"]["SafeMR"]["temperature_lr"] = 3e-4
+    assert {r.path for r in resolve(spelled_out).runs} == {r.path for r in resolve(VALID).runs}
+
+
+def test_version_bumps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {run.path for run in resolve(VALID).runs}
+    module = runs.importlib.import_module("safemr.algorithms.ppo_lagrangian")
+    monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
+    runs.load_algorithm.cache_clear()
+    after = {run.path for run in resolve(VALID).runs}
+    runs.load_algorithm.cache_clear()
+    assert {path.parts[2] for path in after - before} == {"PPO-L"}
+    assert len(after - before) == 4
+
+
+def test_later_files_replace_whole_sections(tmp_path: Path) -> None:
+    overlay = tmp_path / "overlay.yaml"
+    overlay.write_text("algorithms: {Mine: {algorithm: fac, critic_lr: 1e-3}}\n")
+    loaded = config.load([DEFAULT, overlay], {"seeds": [7]})
+    assert list(loaded.algorithms) == ["Mine"]
+    assert loaded.algorithms["Mine"].overrides == {"critic_lr": 0.001}
+    assert loaded.seeds == (7,)
+    assert loaded.tasks == config.load([DEFAULT]).tasks
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda p: p.stem)
+def test_every_shipped_config_is_valid(path: Path) -> None:
+    assert resolve(yaml.load(path.read_text(), config._StrictLoader)).runs
+
+
+def test_the_paper_grid_has_170_runs() -> None:
+    plan = runs.resolve(config.load([ROOT / "config/paper.yaml"]))
+    assert len(plan.navigation) == 7 * 4 * 5
+    assert len(plan.aircraft) == 4 * 5
+    assert len(plan.trained) == 140 + 2 * 5 + 20
+
+
+def test_plans_are_remembered_until_something_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    calls = []
+    real = runs.resolve
+    monkeypatch.setattr(runs, "resolve", lambda c: calls.append(c) or real(c))
+    first = plan_for(config.parse(VALID))
+    assert plan_for(config.parse(VALID)) == first
+    assert len(calls) == 1
+    plan_for(config.parse(changed(("seeds",), [5])))
+    assert len(calls) == 2
+    (tmp_path / "results/.work/plan.json").write_text("{")
+    assert plan_for(config.parse(VALID)) == first
+    assert len(calls) == 3
+
+
+@pytest.mark.parametrize(
+    ("value", "hint", "expected"),
+    [
+        (1, float, 1.0),
+        (True, bool, True),
+        ([1, 2], tuple[float, ...], (1.0, 2.0)),
+        ([1, 2], tuple[int, int], (1, 2)),
+        (None, int | None, None),
+        (3, int | None, 3),
+        ("elu", str, "elu"),
+    ],
+)
+def test_coercion_keeps_types(value: Any, hint: Any, expected: Any) -> None:
+    result = runs.coerce(value, hint, "x")
+    assert result == expected
+    assert type(result) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("value", "hint"),
+    [
+        (True, float),
+        (True, int),
+        (1.0, int),
+        ("1", float),
+        ([1], tuple[int, int]),
+        (1, bool),
+        (0, str),
+    ],
+)
+def test_coercion_refuses_what_is_not_the_type(value: Any, hint: Any) -> None:
+    with pytest.raises(UserError, match="x must be"):
+        runs.coerce(value, hint, "x")

@@ -1,0 +1,130 @@
+"""An implementation outside `safemr` whose records take part like any other."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from safemr import records
+from safemr.config import load
+from safemr.runs import resolve
+
+ROOT = Path(__file__).resolve().parents[1]
+PROGRAM = ROOT / "examples/outside/cross_entropy.py"
+
+
+@pytest.fixture(scope="module")
+def record(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """(results root, record folder) of one short run, made by the command of the rule."""
+    outside = {
+        "CEM": {
+            "algorithm": "cross_entropy",
+            "steps": 400,
+            "hyperparameters": {"population": 4, "elites": 2},
+        }
+    }
+    short = {"Pillars-0.15-Goal": {"settings": {"max_episode_steps": 50}}}
+    config = load(
+        [ROOT / "config/smoke.yaml"],
+        {"outside": outside, "task_overrides": short, "tasks": ["Pillars-0.15-Goal"]},
+    )
+    run = resolve(config).outside[0]
+    root = tmp_path_factory.mktemp("results")
+    command = [
+        sys.executable, str(PROGRAM), "--config", run.resolved, "--variant", run.variant,
+        "--out", str(root / run.path),
+    ]  # fmt: skip
+    subprocess.run(command, check=True, cwd=ROOT, env=_environment(), timeout=120)
+    return root, run.path
+
+
+def _environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+
+
+def test_record_is_accepted_and_read_like_any_other(record):
+    root, folder = record
+    records.verify_record(root / folder)
+    index, progress = records.read_records(root)
+    assert index[["task", "variant", "seed", "algorithm", "steps"]].iloc[0].tolist() == [
+        "Pillars-0.15-Goal",
+        "CEM",
+        100,
+        "cross_entropy",
+        400,
+    ]
+    metrics = set(progress["metric"])
+    assert {"eval_return", "eval_cost", "eval_zero_violation_share", "train_return"} <= metrics
+    assert progress["step"].max() >= 400
+    lengths = progress.loc[progress["metric"] == "eval_length", "value"]
+    assert set(lengths) == {50.0}
+
+
+def test_program_is_independent_of_safemr():
+    names = {
+        name
+        for node in ast.walk(ast.parse(PROGRAM.read_text()))
+        for name in (
+            [alias.name for alias in node.names]
+            if isinstance(node, ast.Import)
+            else [node.module or ""]
+            if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    }
+    assert not any(name.split(".")[0] in ("safemr", "torch") for name in names)
+    assert {"numpy", "gymnasium"} <= names
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "complaint"),
+    [
+        ("progress.csv", lambda text: text.replace("eval_cost,", "evaluation_cost,"), "checksum"),
+        ("config.json", lambda text: text.replace('"seed":100', '"seed":101'), "checksum"),
+        ("provenance.json", lambda text: text.replace('"complete"', '"running"'), "complete"),
+        ("provenance.json", lambda text: text.replace('"schema": 1', '"schema": 7'), "schema"),
+        ("provenance.json", lambda text: text.replace('"digest"', '"hash"'), "lacks digest"),
+    ],
+)
+def test_malformed_record_is_refused_with_its_fault(record, tmp_path, file, change, complaint):
+    root, folder = record
+    copy = tmp_path / folder
+    copy.mkdir(parents=True)
+    for name in records.REQUIRED_FILES:
+        text = (root / folder / name).read_text()
+        (copy / name).write_text(change(text) if name == file else text)
+    with pytest.raises(records.RecordError, match=complaint) as caught:
+        records.verify_record(copy)
+    assert "\n" not in str(caught.value)
+
+
+def test_curves_without_an_evaluation_are_refused(record, tmp_path):
+    """Checksums in order, but a column that every table needs is missing."""
+    root, folder = record
+    config = json.loads((root / folder / records.CONFIG).read_text())
+    rows = [{"step": 400, "eval_return": 1.0, "eval_zero_violation_share": 1.0}]
+    records.write_record(tmp_path / folder, config, "CEM", rows, {})
+    with pytest.raises(records.RecordError, match="no eval_cost"):
+        records.verify_record(tmp_path / folder)
+
+
+def test_unknown_hyperparameter_is_named(tmp_path, record):
+    root, folder = record
+    config = json.loads((root / folder / records.CONFIG).read_text())
+    config["algorithm"]["hyperparameters"] = {"popluation": 3}
+    command = [
+        sys.executable, str(PROGRAM), "--config", records.canonical_json(config), "--variant", "CEM",
+        "--out", str(tmp_path / "out"),
+    ]  # fmt: skip
+    done = subprocess.run(
+        command, cwd=ROOT, env=_environment(), capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2
+    assert "popluation" in done.stderr
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,177 @@
+"""Statistics against closed forms, scipy, and simulated coverage."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from safemr import statistics
+from safemr.errors import UserError
+
+FIVE = np.array([17.3, 15.9, 16.8, 19.1, 14.2])
+OTHER = np.array([12.1, 13.5, 11.0, 12.9, 14.4])
+
+
+def tidy(values: dict[tuple[str, str, int], list[float]], metric: str = "eval_return"):
+    """A tidy table with one row per list entry, logged at steps 10, 20, ..."""
+    rows = [
+        (task, variant, seed, 10 * (index + 1), metric, value)
+        for (task, variant, seed), series in values.items()
+        for index, value in enumerate(series)
+    ]
+    return pd.DataFrame(rows, columns=["task", "variant", "seed", "step", "metric", "value"])
+
+
+def test_mean_interval_is_the_one_sample_t_interval():
+    interval = stats.ttest_1samp(FIVE, 0.0).confidence_interval(0.95)
+    estimate = statistics.mean_interval(np.append(FIVE, np.nan))
+    assert estimate.count == 5
+    np.testing.assert_allclose(
+        estimate[:3], (FIVE.mean(), interval.low, interval.high), rtol=1e-12
+    )
+
+
+def test_mean_interval_of_two_runs_by_hand():
+    # n = 2: s / sqrt(2) = |x1 - x2| / 2 and t(1) at 97.5% is tan(pi (0.975 - 0.5))
+    estimate = statistics.mean_interval(np.array([1.0, 2.0]))
+    assert estimate.half_width == pytest.approx(0.5 * np.tan(0.475 * np.pi))
+
+
+@pytest.mark.parametrize(("values", "count"), [([], 0), ([3.0], 1), ([np.nan], 0)])
+def test_too_few_runs_have_no_interval(values, count):
+    estimate = statistics.mean_interval(np.array(values))
+    assert estimate.count == count
+    assert np.isnan(estimate.low) and np.isnan(estimate.high)
+
+
+def test_difference_interval_is_welch():
+    reference = stats.ttest_ind(FIVE, OTHER, equal_var=False).confidence_interval(0.95)
+    estimate = statistics.difference_interval(FIVE, OTHER)
+    np.testing.assert_allclose(estimate[1:3], (reference.low, reference.high), rtol=1e-10)
+
+
+def test_improvement_limits_solve_fiellers_equation():
+    estimate = statistics.improvement_interval(FIVE, OTHER)
+    assert estimate.mean == pytest.approx(FIVE.mean() / OTHER.mean() - 1)
+    v1, v2 = FIVE.var(ddof=1) / 5, OTHER.var(ddof=1) / 5
+    ratio = FIVE.mean() / OTHER.mean()
+    freedom = (v1 + ratio**2 * v2) ** 2 / (v1**2 / 4 + (ratio**2 * v2) ** 2 / 4)
+    for limit in (estimate.low + 1, estimate.high + 1):
+        z = (FIVE.mean() - limit * OTHER.mean()) / np.sqrt(v1 + limit**2 * v2)
+        assert abs(z) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-9)
+
+
+def test_improvement_covers_the_true_ratio_at_its_nominal_rate():
+    generator = np.random.default_rng(5)
+    hits = 0
+    for _ in range(2000):
+        limits = statistics.improvement_interval(
+            generator.normal(12, 2, size=5), generator.normal(10, 1, size=5)
+        )
+        hits += limits.low <= 0.2 <= limits.high
+    assert 0.93 <= hits / 2000 <= 0.97
+
+
+def test_improvement_over_a_baseline_that_may_be_zero_is_unbounded():
+    estimate = statistics.improvement_interval(FIVE, np.array([-1.0, 0.5, 1.0, 2.0, -0.5]))
+    assert estimate.low == -np.inf and estimate.high == np.inf
+    assert np.isnan(statistics.improvement_interval(FIVE, -OTHER).mean)
+
+
+def test_iqm_drops_a_quarter_on_each_side():
+    assert statistics.interquartile_mean(np.arange(8.0)) == pytest.approx((2 + 3 + 4 + 5) / 4)
+    assert statistics.interquartile_mean(np.array([0, 1, 2, 3, 1e9])) == pytest.approx(2.0)
+
+
+def test_stratified_bootstrap_matches_full_enumeration():
+    """With 3 seeds in each of 2 tasks all 3^6 resamples can be listed: the exact distribution."""
+    samples = {"a": np.array([0.0, 1.0, 5.0]), "b": np.array([10.0, 12.0, 13.0])}
+
+    def statistic(draw):
+        return np.mean([values.mean(-1) for values in draw.values()], axis=0)
+
+    exact = [
+        (np.mean(a) + np.mean(b)) / 2
+        for a in itertools.product(samples["a"], repeat=3)
+        for b in itertools.product(samples["b"], repeat=3)
+    ]
+    low, high = np.quantile(exact, [0.025, 0.975])
+    estimate = statistics.stratified_bootstrap(samples, statistic, seed=1, replicates=20_000)
+    assert estimate.low == pytest.approx(low, abs=0.1)
+    assert estimate.high == pytest.approx(high, abs=0.1)
+    again = statistics.stratified_bootstrap(samples, statistic, seed=1, replicates=20_000)
+    assert again == estimate
+    assert statistics.stratified_bootstrap(samples, statistic, seed=2, replicates=500) != estimate
+
+
+@given(
+    st.lists(st.integers(-5, 5), min_size=1, max_size=8),
+    st.lists(st.integers(-5, 5), min_size=1, max_size=8),
+)
+def test_probability_of_improvement_is_mann_whitney(x, y):
+    expected = stats.mannwhitneyu(x, y).statistic / (len(x) * len(y))
+    first, second = {"t": np.array(x)}, {"t": np.array(y)}
+    assert statistics.probability_of_improvement(first, second) == pytest.approx(expected)
+    backwards = statistics.probability_of_improvement(second, first)
+    assert backwards == pytest.approx(1 - expected)
+
+
+def test_probability_of_improvement_needs_a_common_task():
+    with pytest.raises(UserError, match="no task in common"):
+        statistics.probability_of_improvement({"a": FIVE}, {"b": OTHER})
+
+
+def test_improvement_probability_of_separated_samples_is_certain():
+    estimate = statistics.improvement_probability({"a": FIVE + 10}, {"a": OTHER, "b": OTHER})
+    assert estimate[:3] == (1.0, 1.0, 1.0)
+
+
+def test_performance_profile_is_the_survival_function_averaged_over_tasks():
+    samples = {"a": np.array([0.2, 0.6]), "b": np.array([0.5, 0.5, 1.5, 2.0])}
+    profile = statistics.performance_profile(
+        samples, np.array([0.0, 0.5, 1.0, 3.0]), replicates=200
+    )
+    np.testing.assert_allclose(profile["mean"], [1.0, 0.5, 0.25, 0.0])
+    assert (profile["low"] <= profile["mean"]).all() and (profile["mean"] <= profile["high"]).all()
+
+
+def test_final_scores_average_the_last_tenth_of_the_evaluations():
+    progress = tidy({("t", "A", 0): list(range(30)), ("t", "B", 1): [1.0, 2.0]})
+    other = tidy({("t", "A", 0): [100.0] * 27 + [0.0, 3.0, 6.0]}, metric="sigma")
+    scores = statistics.final_scores(pd.concat([progress, other]))
+    assert statistics.scores_of(scores, "t", "A", "eval_return") == pytest.approx([28.0])
+    assert statistics.scores_of(scores, "t", "A", "sigma") == pytest.approx([3.0])
+    assert statistics.scores_of(scores, "t", "B", "eval_return") == pytest.approx([2.0])
+    assert len(statistics.scores_of(scores, "t", "C", "eval_return")) == 0
+
+
+def test_learning_curves_interpolate_runs_logged_at_different_steps():
+    progress = tidy({("t", "A", 0): [1.0, 2.0, 3.0, 4.0], ("t", "A", 1): [3.0, 4.0, 5.0]})
+    progress.loc[progress["seed"] == 1, "step"] += 5  # 15, 25, 35
+    curves = statistics.learning_curves(progress, "eval_return")
+    assert list(curves["step"]) == [15, 25, 35]
+    np.testing.assert_allclose(curves["mean"], [2.25, 3.25, 4.25])
+    assert set(curves["count"]) == {2}
+
+
+def test_summary_holds_mean_and_iqm_of_each_metric():
+    progress = tidy({("t", "A", seed): [value] for seed, value in enumerate(FIVE)})
+    row = statistics.summarise(statistics.final_scores(progress)).iloc[0]
+    assert row["mean"] == pytest.approx(FIVE.mean())
+    assert row["iqm"] == pytest.approx(np.sort(FIVE)[1:4].mean())
+    assert row["iqm_low"] < row["iqm"] < row["iqm_high"]
+    assert row["count"] == 5
+
+
+def test_missing_runs_are_listed_in_the_expected_order():
+    expected = pd.DataFrame(
+        [("t", "A", 0), ("t", "A", 1), ("u", "B", 0)], columns=["task", "variant", "seed"]
+    )
+    missing = statistics.missing_runs(expected, expected.iloc[[1]])
+    assert list(missing.itertuples(index=False, name=None)) == [("t", "A", 0), ("u", "B", 0)]

@@ -1,0 +1,283 @@
+"""The pipeline: what is scheduled, what is never trained again, and what happens after a kill."""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from safemr import config, records, runs
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ("Snakefile", "config", "envs", "safemr", "workflow")
+GRID: dict[str, Any] = {
+    "tasks": ["Pillars-0.15-Goal"],
+    "algorithms": {
+        "SafeMR": {"algorithm": "safemr", "start_steps": 200},
+        "FAC-phi0": {"algorithm": "fac", "sigma": 0.0, "k": 0.0, "n": 1.0, "start_steps": 200},
+    },
+    "seeds": [100, 101],
+    "budget": {"off_policy": 2000},
+    "log_points": 20,
+    "evaluation": {"points": 2, "episodes": 1},
+    "task_overrides": {},
+    "sensitivity": None,
+    "aircraft": None,
+}
+
+
+class Checkout:
+    """A temporary copy of the repository's sources, with a small grid as its default."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        for name in SOURCES:
+            source, target = ROOT / name, folder / name
+            if source.is_dir():
+                shutil.copytree(source, target)  # compiled code too: it saves half a minute
+            else:
+                shutil.copy(source, target)
+
+    def configure(self, **changes: Any) -> None:
+        (self.folder / "config/config.yaml").write_text(yaml.safe_dump({**GRID, **changes}))
+
+    def plan(self) -> runs.Plan:
+        """The plan of the checkout, by this repository's own sources."""
+        return runs.resolve(config.load([self.folder / "config/config.yaml"]))
+
+    def command(self, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "snakemake", "-j2", *arguments]
+
+    def snakemake(self, *arguments: str, check: bool = True) -> str:
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        environment.pop("PYTHONPATH", None)
+        done = subprocess.run(
+            self.command(*arguments),
+            cwd=self.folder,
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=300,
+        )
+        assert (done.returncode == 0) == check, done.stdout
+        return done.stdout
+
+    def scheduled(self, *arguments: str) -> dict[str, int]:
+        """Rule -> number of jobs of a dry run."""
+        printed = self.snakemake("-n", "all", *arguments)
+        table = printed.partition("Job stats:")[2].partition("total")[0]
+        return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M)}
+
+    def fill_in_records(self) -> None:
+        """A record for every run of the plan, without training."""
+        for run in self.plan().runs:
+            rows = [
+                {
+                    **{"step": step, "eval_return": 1.0, "eval_cost": 0.0},
+                    **{"eval_cost_indicator": 0.0, "eval_zero_violation_share": 1.0},
+                }
+                for step in (run.config["steps"] // 2, run.config["steps"])
+            ]
+            folder = self.folder / "results" / run.path
+            records.write_record(folder, run.config, run.variant, rows, {"cpu_s": 60.0})
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    copy = Checkout(tmp_path)
+    copy.configure()
+    return copy
+
+
+def test_the_shipped_default_schedules_every_run_once(tmp_path: Path) -> None:
+    copy = Checkout(tmp_path)
+    assert copy.scheduled()["train"] == len(copy.plan().trained)
+
+
+def test_a_fresh_clone_trains_only_what_changed(checkout: Checkout) -> None:
+    """Git sets modification times in any order, and a clone has no Snakemake metadata."""
+    checkout.fill_in_records()
+    generator = random.Random(3)
+    for path in checkout.folder.rglob("*"):
+        os.utime(path, (generator.uniform(1e9, 1.7e9),) * 2)
+    assert "train" not in checkout.scheduled()
+
+    changed = {**GRID["algorithms"], "SafeMR": {"algorithm": "safemr", "gamma": 0.98}}
+    checkout.configure(algorithms=changed)
+    assert checkout.scheduled()["train"] == 2
+    checkout.configure(seeds=[100, 102])
+    assert checkout.scheduled()["train"] == 2
+    # A version bump of the algorithm that others build on touches only those who share its file.
+    checkout.configure()
+    module = checkout.folder / "safemr/algorithms/fac.py"
+    module.write_text(re.sub(r"(?m)^VERSION = \d+$", "VERSION = 999", module.read_text()))
+    assert checkout.scheduled()["train"] == 2
+
+
+def test_adding_a_baseline_is_one_file_and_one_line(checkout: Checkout) -> None:
+    checkout.fill_in_records()
+    algorithms = checkout.folder / "safemr/algorithms"
+    (algorithms / "my_baseline.py").write_text((algorithms / "fac.py").read_text())
+    path = checkout.folder / "config/config.yaml"
+    line = "algorithms:\n  Mine: {algorithm: my_baseline, gamma: 0.97}\n"
+    path.write_text(path.read_text().replace("algorithms:\n", line))
+    jobs = checkout.scheduled()
+    assert jobs["train"] == len(GRID["tasks"]) * len(GRID["seeds"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"sedes": [1]}, "unknown key 'sedes' in the config; did you mean 'seeds'?"),
+        ({"algorithms": {"X": {"algorithm": "safmr"}}}, "did you mean 'safemr'?"),
+    ],
+)
+def test_a_wrong_config_stops_snakemake_with_one_line(
+    changes: dict[str, Any], expected: str, checkout: Checkout
+) -> None:
+    checkout.configure(**changes)
+    before = set(checkout.folder.iterdir())
+    printed = checkout.snakemake("-n", "all", check=False)
+    assert sum(expected in line for line in printed.splitlines()) == 1
+    assert "Traceback" not in printed
+    assert set(checkout.folder.iterdir()) - before <= {checkout.folder / ".snakemake"}
+
+
+def test_every_rule_states_log_and_threads() -> None:
+    for path in sorted((ROOT / "workflow/rules").glob("*.smk")):
+        for rule in re.split(r"(?m)^(?=rule )", path.read_text())[1:]:
+            name = rule.partition(":")[0]
+            assert re.search(r"(?m)^    log:", rule), f"{path.name}: {name} has no log"
+            assert re.search(r"(?m)^    threads: ", rule), f"{path.name}: {name} has no threads"
+
+
+def marker(checkout: Checkout, output: str) -> Path:
+    """Snakemake's mark that an output was being written."""
+    folder = checkout.folder / ".snakemake/incomplete"
+    folder.mkdir(parents=True, exist_ok=True)
+    name = base64.urlsafe_b64encode(output.encode()).decode()
+    parts = [name[i : i + 254] for i in range(0, len(name), 254)]
+    path = folder.joinpath(*(f"@{part}" for part in parts[:-1]), parts[-1])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text('{"external_jobid": null}')
+    return path
+
+
+def lock_outputs(checkout: Checkout) -> None:
+    """The lock that a killed Snakemake leaves."""
+    folder = checkout.folder / ".snakemake/locks"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "0.output.lock").write_text("results/summary/runs.csv\n")
+
+
+def test_what_a_killed_snakemake_leaves_needs_no_manual_step(checkout: Checkout) -> None:
+    checkout.fill_in_records()
+    record = checkout.plan().runs[0].path
+    provenance = f"results/{record}/provenance.json"
+    half_written = checkout.folder / "results/summary/runs.csv"
+    half_written.parent.mkdir()
+    half_written.write_text("half")
+    lock_outputs(checkout)
+    marks = [marker(checkout, provenance), marker(checkout, "results/summary/runs.csv")]
+    before = (checkout.folder / provenance).read_bytes()
+    checkout.snakemake("aggregate")
+    assert not any(mark.exists() for mark in marks)
+    assert (checkout.folder / provenance).read_bytes() == before
+    assert half_written.read_text().startswith("task,")
+
+
+def test_a_live_snakemake_keeps_its_lock(checkout: Checkout) -> None:
+    checkout.fill_in_records()
+    lock_outputs(checkout)
+    with open(checkout.folder / ".snakemake/alive", "w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_SH)
+        assert "cannot be locked" in checkout.snakemake("aggregate", check=False)
+
+
+def test_a_record_that_cannot_be_believed_stops_the_aggregation(checkout: Checkout) -> None:
+    checkout.fill_in_records()
+    folder = Path("results") / checkout.plan().runs[1].path
+    progress = checkout.folder / folder / "progress.csv"
+    progress.write_text(progress.read_text().replace("1.0", "9.0"))
+    printed = checkout.snakemake("aggregate", check=False)
+    fault = f"error: record {folder}: progress.csv does not have the checksum"
+    assert sum(line.startswith(fault) for line in printed.splitlines()) == 1
+    assert "Traceback" not in printed
+    assert not (checkout.folder / "results/summary/runs.csv").exists()
+
+
+def begun(checkout: Checkout) -> bool:
+    """Whether a run has written its first progress and none has finished."""
+    return bool(list(checkout.folder.glob("results/.work/*/progress.csv")))
+
+
+def wait_until(condition: Any, *arguments: Any, seconds: float = 240) -> None:
+    end = time.monotonic() + seconds
+    while not condition(*arguments):
+        assert time.monotonic() < end, f"{condition.__name__} did not come true"
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def started(checkout: Checkout) -> Iterator[subprocess.Popen[bytes]]:
+    checkout.configure(seeds=[100])
+    with open(checkout.folder / "first.log", "wb") as log:
+        process = subprocess.Popen(
+            checkout.command("all"), cwd=checkout.folder, stdout=log, stderr=log
+        )
+    yield process
+    process.kill()
+    process.wait()
+
+
+def test_from_nothing_to_figures_across_a_kill(
+    checkout: Checkout, started: subprocess.Popen[bytes]
+) -> None:
+    """SIGKILL to Snakemake in the middle of training; the same command ends with every figure."""
+    wait_until(begun, checkout)
+    started.kill()
+    started.wait()
+    checkout.snakemake("all")
+    for run in checkout.plan().runs:
+        records.verify_record(checkout.folder / "results" / run.path)
+    assert not list(checkout.folder.glob("results/.work/*/*"))
+    for name in ("paper_figures/training_curves.pdf", "results/tables/table1.md"):
+        assert (checkout.folder / name).stat().st_size > 500
+    # Nothing is left to do, also when the training rule's text or the mirror changes.
+    rule = checkout.folder / "workflow/rules/train.smk"
+    rule.write_text(rule.read_text().replace("python", "python").replace("--wait", "--wait "))
+    checkout.configure(seeds=[100], wandb={"mode": "offline"})
+    assert checkout.scheduled() == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_many_kills_of_snakemake(number: int, checkout: Checkout) -> None:
+    """Kills at random moments, the orphans included in what may go wrong."""
+    checkout.configure(seeds=[100], budget={"off_policy": 20_000})
+    generator = random.Random(number)
+    for _ in range(6):
+        with open(checkout.folder / "killed.log", "ab") as log:
+            process = subprocess.Popen(
+                checkout.command("all"), cwd=checkout.folder, stdout=log, stderr=log
+            )
+        time.sleep(generator.uniform(3.0, 25.0))
+        process.send_signal(number)
+        process.wait(240)
+    checkout.snakemake("all")
+    for run in checkout.plan().runs:
+        records.verify_record(checkout.folder / "results" / run.path)

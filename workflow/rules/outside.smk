@@ -1,0 +1,25 @@
+# Implementations outside `safemr`: whatever writes the record (docs/adding_a_baseline.md) takes part
+# in tables and figures. One rule each; their labels, budgets and hyperparameters stand under
+# `outside` in the configuration.
+def outside_runs(algorithm):
+    """The runs of the entries of `outside` that name this algorithm."""
+    return [run for run in PLAN.outside if run.config["algorithm"]["name"] == algorithm]
+
+
+rule cross_entropy:
+    output:
+        expand(f"{RECORD}/{{name}}", name=REQUIRED_FILES, allow_missing=True),
+    log:
+        f"{LOGS}/outside/{{task}}_{{variant}}_seed{{seed}}-{{digest}}.log",
+    wildcard_constraints:
+        variant=one_of(run.path.parts[2] for run in outside_runs("cross_entropy")),
+        digest=one_of(run.digest for run in outside_runs("cross_entropy")),
+    threads: 1
+    params:
+        resolved=lambda wildcards: run_of(wildcards).resolved,
+        variant=lambda wildcards: run_of(wildcards).variant,
+        folder=lambda wildcards: RECORD.format(**wildcards),
+        program=os.path.join(workflow.basedir, "examples/outside/cross_entropy.py"),
+    shell:
+        "{sys.executable:q} {params.program:q} --config {params.resolved:q}"
+        " --variant {params.variant:q} --out {params.folder:q} > {log:q} 2>&1"

@@ -1,0 +1,50 @@
+# After a SIGKILL or a power failure the next `snakemake` just continues. No rules.
+#
+# Snakemake leaves two things behind when it is killed: its lock, which nothing but a person would
+# remove, and markers of outputs that were being written, which stop the next start. Both are
+# cleared here when no other Snakemake process is alive in this folder. Liveness is an advisory file
+# lock that every process holds to its end and that the kernel drops with it.
+import base64
+import fcntl
+import shutil
+from pathlib import Path
+
+IS_RECORD = re.compile(r"seed\d+-[0-9a-f]{12}").fullmatch
+
+
+def marked_files(folder):
+    """Snakemake's bookkeeping files in a folder and the output that each is about."""
+    for path in filter(Path.is_file, Path(folder).rglob("*")):
+        encoded = "".join(part.removeprefix("@") for part in path.relative_to(folder).parts)
+        try:
+            yield path, Path(base64.urlsafe_b64decode(encoded).decode())
+        except ValueError:
+            continue
+
+
+def recover(state):
+    """Clear what a killed process left; returns the descriptor that says this one is alive."""
+    state.mkdir(exist_ok=True)
+    alive = os.open(state / "alive", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(alive, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pass
+    else:
+        shutil.rmtree(state / "locks", ignore_errors=True)
+        for marker, output in marked_files(state / "incomplete"):
+            # A record is complete or absent by itself; anything else may be half written.
+            if not IS_RECORD(output.parent.name):
+                output.unlink(missing_ok=True)
+            marker.unlink()
+        # A record's folder name says everything about it; what Snakemake remembers of the job
+        # (its shell command, for one) must not make it train again.
+        for entry, output in marked_files(state / "metadata"):
+            if IS_RECORD(output.parent.name):
+                entry.unlink()
+    fcntl.flock(alive, fcntl.LOCK_SH)
+    return alive
+
+
+if workflow.is_main_process:
+    ALIVE = recover(Path(".snakemake"))

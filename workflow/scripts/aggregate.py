@@ -1,0 +1,18 @@
+"""Verify and read the records of the configured runs; write the tidy tables."""
+
+from pathlib import Path
+
+import pandas as pd
+
+from safemr import records, statistics
+from safemr.cli import reported_errors
+
+with reported_errors():
+    runs, progress = records.read_records(Path(snakemake.params.root), snakemake.params.folders)
+runs.to_csv(snakemake.output.runs, index=False)
+progress.to_csv(
+    snakemake.output.progress, index=False, compression={"method": "gzip", "compresslevel": 1}
+)
+minutes = runs[["task", "variant", "seed"]].assign(metric="minutes", value=runs["cpu_s"] / 60)
+scores = pd.concat([statistics.final_scores(progress), minutes.dropna()], ignore_index=True)
+scores.to_csv(snakemake.output.scores, index=False)

@@ -1,0 +1,21 @@
+"""Return, cost and learned parameters at each point [a, b]."""
+
+from pathlib import Path
+
+import pandas as pd
+
+from safemr import statistics, tables
+from safemr.plotting import curves, style
+
+params = snakemake.params
+points = {variant: (a, b) for variant, (a, b) in params.points.items()}
+progress = pd.read_csv(snakemake.input.progress)
+chosen = progress[progress["task"] == params.task]
+returns, costs = (
+    statistics.learning_curves(chosen, metric) for metric in ("eval_return", "eval_cost")
+)
+figure = curves.sensitivity(returns, costs, points)
+style.save(figure, Path(snakemake.output.pdf).with_suffix(""))
+learned = statistics.last_values(chosen, ("sigma", "k", "n"))
+table = tables.table_two(learned, points, task=params.task)
+table.write(Path(snakemake.output.table[0]).parent)
