@@ -19,6 +19,13 @@ include: "workflow/rules/sensitivity.smk"
 include: "workflow/rules/aircraft.smk"
 
 
+onerror:
+    print(f"What is complete, and why the rest is not, says: safemr records {RESULTS}")
+    print(
+        "Tables and figures of what is complete: snakemake -j2 all --config allow_missing=true"
+    )
+
+
 rule all:
     default_target: True
     input:

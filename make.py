@@ -1,6 +1,6 @@
 """Set up an environment and run this repository in it; needs nothing but Python 3.11 or later.
 
-    python3 make.py all [ARGUMENTS]    snakemake -j2 all ARGUMENTS
+    python3 make.py all [ARGUMENTS]    snakemake -j2 --keep-going all ARGUMENTS
     python3 make.py test [ARGUMENTS]   the fast tests: pytest -n 2 -m "not slow" ARGUMENTS
     python3 make.py run -- COMMAND     any command inside the environment
     python3 make.py lock               renew requirements.lock from pyproject.toml
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str]) -> int:
     if command == "lock" and not rest:
         return write_lock()
     if command == "all":
-        return run("python", "-m", "snakemake", "-j2", "all", *rest)
+        return run("python", "-m", "snakemake", "-j2", "--keep-going", "all", *rest)
     if command == "test":
         return run("python", "-m", "pytest", "-n", "2", "-m", "not slow", *rest)
     if command == "run" and rest and rest != ["--"]:

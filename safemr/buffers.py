@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numba
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+Floats = NDArray[np.float32]
+Rows = NDArray[np.int64]
 
 
 class Batch(NamedTuple):
@@ -57,7 +63,8 @@ class Replay:
         size, where = capacity * num_envs, torch.device(device)
 
         def table(*shape: int) -> Tensor:
-            return torch.zeros(size, *shape, device=where)
+            # numpy asks the system for huge pages, from which random rows are read faster
+            return torch.from_numpy(np.zeros((size, *shape), np.float32)).to(where)
 
         self._fields = {
             "observations": table(observation_dim),
@@ -85,42 +92,55 @@ class Replay:
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """``count`` transitions, uniformly with replacement."""
         flat = torch.randint(self.size * self.num_envs, (count,), generator=generator)
-        flat = flat.to(self._lags.device)
-        return self._gather(flat)
+        return self._gather(flat.to(self._lags.device))
 
     def _gather(self, flat: Tensor) -> Batch:
-        fields, num_envs = self._fields, self.num_envs
-        age = flat // num_envs  # 0 = oldest
-        start = (self._head - self.size) % self.capacity
-        column = flat - age * num_envs
-        rows = ((age + start) % self.capacity) * num_envs + column
-        if self.n_step == 1:
-            returns, last = fields["rewards"][rows], rows
-            steps = torch.ones_like(rows)
-        else:
-            # [n, B]: the rows of the following steps, as far as the episode and the ring go
-            path = (age + self._lags[:, None] + start) % self.capacity * num_envs + column
-            over = fields["ended"][path]
-            over[1:] = over.cumsum(0)[:-1]
-            over[0] = 0.0
-            alive = (over == 0) & (age + self._lags[:, None] < self.size)
-            weights = self._discount[:-1, None] * alive
-            returns = (fields["rewards"][path] * weights).sum(0)
-            steps = alive.sum(0)
-            last = path.gather(0, steps[None] - 1)[0]
+        """The transitions ``flat`` [B], counted from the oldest one held."""
+        fields = self._fields
+        follow = self._follow_compiled if flat.device.type == "cpu" else self._follow
+        rows, last, returns, discounts = follow(flat)
         distances = fields["distances"].index_select(0, rows).chunk(4, -1)
         return Batch(
             observations=fields["observations"].index_select(0, rows),
             actions=fields["actions"].index_select(0, rows),
             returns=returns,
-            discounts=self._discount[steps] * (1.0 - fields["terminated"][last]),
+            discounts=discounts,
             bootstraps=fields["next_observations"].index_select(0, last),
-            costs=fields["costs"][rows],
+            costs=fields["costs"].index_select(0, rows),
             d=distances[0],
             d_dot=distances[1],
             d_next=distances[2],
             d_dot_next=distances[3],
         )
+
+    def _follow(self, flat: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """First and last row of each n-step return, the return and the bootstrap's discount."""
+        fields, num_envs = self._fields, self.num_envs
+        age = flat // num_envs  # 0 = oldest
+        start = (self._head - self.size) % self.capacity
+        # [n, B]: the rows of the following steps, as far as the episode and the ring go
+        path = (age + self._lags[:, None] + start) % self.capacity * num_envs + flat % num_envs
+        over = fields["ended"][path]
+        over[1:] = over.cumsum(0)[:-1]
+        over[0] = 0.0
+        alive = (over == 0) & (age + self._lags[:, None] < self.size)
+        returns = (fields["rewards"][path] * self._discount[:-1, None] * alive).sum(0)
+        steps = alive.sum(0)
+        last = path.gather(0, steps[None] - 1)[0]
+        return path[0], last, returns, self._discount[steps] * (1.0 - fields["terminated"][last])
+
+    def _follow_compiled(self, flat: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """`_follow` on a CPU, in a tenth of its time."""
+        names = ("rewards", "ended", "terminated")
+        rows, last, returns, discounts = _follow(
+            flat.numpy(),
+            (self._head - self.size) % self.capacity * self.num_envs,
+            self.num_envs,
+            self.size,
+            *(self._fields[name].numpy() for name in names),
+            self._discount.numpy(),
+        )
+        return tuple(map(torch.from_numpy, (rows, last, returns, discounts)))  # type: ignore[return-value]
 
     def state_dict(self) -> dict[str, Any]:
         rows = self.size * self.num_envs
@@ -136,3 +156,32 @@ class Replay:
         for name, table in self._fields.items():
             stored = torch.as_tensor(state["fields"][name])
             table[: len(stored)] = stored
+
+
+@numba.njit(cache=True)
+def _follow(
+    flat: Rows,
+    first: int,
+    num_envs: int,
+    held: int,
+    rewards: Floats,
+    ended: Floats,
+    terminated: Floats,
+    discount: Floats,
+) -> tuple[Rows, Rows, Floats, Floats]:
+    """`Replay._follow`; ``first`` is the row of the oldest transition."""
+    n_step = len(discount) - 1
+    rows, last = np.empty_like(flat), np.empty_like(flat)
+    returns, discounts = np.empty(len(flat), np.float32), np.empty(len(flat), np.float32)
+    for b in range(len(flat)):
+        row = (flat[b] + first) % len(rewards)
+        rows[b] = row
+        longest = min(held - flat[b] // num_envs, n_step)
+        total, taken = rewards[row], 1
+        while taken < longest and ended[row] == 0.0:
+            row = (row + num_envs) % len(rewards)
+            total += discount[taken] * rewards[row]
+            taken += 1
+        last[b], returns[b] = row, total
+        discounts[b] = discount[taken] * (np.float32(1.0) - terminated[row])
+    return rows, last, returns, discounts

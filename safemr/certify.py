@@ -94,7 +94,7 @@ def certify(
     envs.close()
     row: dict[str, Any] = {
         "certificate": certificate.name, "task": task, **zeta._asdict(), "eta": eta,
-        **{_column(r.convention, r.braking): r.margin for r in analytic.itertuples()},
+        **{_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()},
         "states": len(search.states), "infeasible_share": search.infeasible_share,
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
         "simulator_agrees": f"{search.confirmed}/{search.examined}",
@@ -145,30 +145,32 @@ def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             display[heading] = ["–" if np.isnan(s) else f"{100 * s:.3f}%" for s in shares]
     caption = (
         "Certificates. Four verdicts of the analytic condition with the smallest margin in m/s^2 "
-        "(C inside: (sigma + d_min)^n, outside: sigma + d_min^n; the deceleration with the robot "
-        "aligned, or from drag alone); share of searched states without a safe action (infeasible), "
-        "of states with phi <= 0 that every action takes out of the safe set (leaking), and the "
-        "worst best margin found, positive where no action is safe. Shares are uniform over "
-        "distance, bearing, course, speed and turn rate; not every such state can be driven to."
+        "(C inside: (sigma + d_min)^n, outside: sigma + d_min^n; deceleration with the robot "
+        "aligned, or from drag alone); share of searched states without a safe action "
+        "(infeasible); of states with phi <= 0 that every action takes out of the safe set "
+        "(leaking); and the worst best margin found, positive where no action is safe. Shares are "
+        "uniform over distance, bearing, course, speed and turn rate; not every such state can be "
+        "driven to."
     )
     return Table("certificates", caption, data, display)
 
 
 def margin_map(
-    task: str, zeta: Zeta, *, eta: float = 0.0, distances: int = 41, bearings: int = 37
+    task: str, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
 ) -> pd.DataFrame:
     """Best margin of the least favourable motion at each distance and bearing.
 
-    The maximum over courses within 0.4 rad of the obstacle, three speeds and five turn rates, of
+    The maximum over courses within 0.4 rad of the obstacle, three speeds and three turn rates of
     the least g over the action grid. Returns distance, bearing, margin; nan where the robot would
     overlap the obstacle. Positive: from some such motion no action is safe.
     """
     envs = falsification.make_simulator(task, 1)
     robot, d_min = falsification.ROBOT, float(envs.d_min)
     reach = falsification.largest_distance(zeta, d_min)
-    turn_rates = robot.max_turn_rate * np.linspace(-1, 1, 5)
+    turn_rates = robot.max_turn_rate * np.linspace(-1, 1, 3)
     axes = (np.linspace(d_min, reach, distances), np.linspace(0, np.pi, bearings),
-            np.linspace(-0.4, 0.4, 3), robot.max_speed * np.array([0.0, 0.5, 1.0]), turn_rates)  # fmt: skip
+            np.linspace(-0.4, 0.4, 3), robot.max_speed * np.array([0.0, 0.5, 1.0]),
+            turn_rates)  # fmt: skip
     states = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 5)
     parts = np.array_split(states, max(1, len(states) // falsification.CHUNK))
     least = np.concatenate(
@@ -257,7 +259,9 @@ def _replay(path: Path) -> int:
         best = int(g.argmin())
         verdict = "no action is safe" if g[best] >= 0 else "a safe action exists"
         a0, a1 = actions[best]
-        print(f"{name}: {len(g)} actions, least g = {g[best]:+.6f} at ({a0:.3f}, {a1:.3f}): {verdict}")
+        print(
+            f"{name}: {len(g)} actions, least g = {g[best]:+.6f} at ({a0:.3f}, {a1:.3f}): {verdict}"
+        )
     return 0
 
 

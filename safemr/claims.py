@@ -9,74 +9,31 @@ of claims.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import numpy as np
 import pandas as pd
 
 from safemr import reference, statistics
+from safemr.evidence import (
+    NOTHING,
+    Evidence,
+    Finding,
+    Verdict,
+    at_most,
+    by_interval,
+    describe,
+    overall,
+    smooth_curves,
+    unavailable,
+)
 from safemr.statistics import Estimate
-from safemr.tables import SafetyRule, Table, best_safe_baseline, describe_missing
-
-Verdict = Literal["confirmed", "refuted", "inconclusive"]
+from safemr.tables import Table, best_safe_baseline
 
 COVERS = 0.01  # a certificate covers the true unsafe set if it misses at most this share of it
-GROWTH = 2.0  # "bounded": the last quarter's largest value is at most this many times what came before
-NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Everything a rule may look at.
-
-    scores: score table of final evaluations (`statistics.final_scores`). progress: tidy table.
-    expected: runs (task, variant, seed) that the configured grid asks for; without it, nothing
-    counts as missing but what a rule needs and cannot find at all. points: variant -> (a, b).
-    aircraft: variant, seed, metric, value with the metrics volume_ratio and missed_share; the
-    handcrafted certificate is the variant FAC-phih. certificates: rows of `certify.certify`.
-    """
-
-    scores: pd.DataFrame
-    progress: pd.DataFrame
-    expected: pd.DataFrame | None = None
-    points: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    aircraft: pd.DataFrame | None = None
-    certificates: pd.DataFrame | None = None
-    rule: SafetyRule = field(default_factory=SafetyRule)
-    tasks: Sequence[str] = reference.TASKS
-
-    def missing(self, pairs: Iterable[tuple[str, str]]) -> str:
-        """What is missing of these (task, variant) pairs, in words; "" if nothing."""
-        runs = self.scores[["task", "variant", "seed"]].drop_duplicates()
-        present = set(zip(runs["task"], runs["variant"], strict=True))
-        texts = []
-        for task, variant in pairs:
-            if self.expected is not None:
-                wanted = self.expected
-                wanted = wanted[(wanted["task"] == task) & (wanted["variant"] == variant)]
-                absent = statistics.missing_runs(wanted, runs)
-                if len(absent):
-                    texts.append(describe_missing(absent))
-                    continue
-            if (task, variant) not in present:
-                texts.append(f"{variant} on {task} (all)")
-        return "; ".join(texts)
-
-    def of(self, task: str, variant: str, metric: str) -> np.ndarray:
-        """[seeds] final scores."""
-        return statistics.scores_of(self.scores, task, variant, metric)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One judged statement: our number, its interval, what follows and why."""
-
-    estimate: Estimate
-    verdict: Verdict
-    reason: str
+GROWTH = 2.0  # "bounded": the last quarter at most this many times the largest before
 
 
 @dataclass(frozen=True)
@@ -90,54 +47,32 @@ class Claim:
     judge: Callable[[Evidence], Finding]
 
 
-def by_interval(estimate: Estimate, threshold: float, what: str) -> Finding:
-    """Confirmed where the interval is above the threshold, refuted where below, else open."""
-    shown = f"{what} {_text(estimate)}"
-    if np.isnan(estimate.low):
-        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
-    if estimate.low > threshold:
-        return Finding(estimate, "confirmed", shown)
-    if estimate.high < threshold:
-        return Finding(estimate, "refuted", shown)
-    return Finding(estimate, "inconclusive", f"{shown}: the interval contains {threshold:g}")
-
-
-def overall(parts: Mapping[str, Finding]) -> Finding:
-    """All parts must hold: one refuted part refutes, one open part leaves it open.
-
-    The estimate is that of the part that decides; the reason names every part.
-    """
-    rank: dict[Verdict, int] = {"refuted": 0, "inconclusive": 1, "confirmed": 2}
-    deciding = min(parts.values(), key=lambda part: rank[part.verdict])
-    reason = "; ".join(f"{name}: {part.verdict}, {part.reason}" for name, part in parts.items())
-    return Finding(deciding.estimate, deciding.verdict, reason)
-
-
 # --- conservativeness (aircraft) -----------------------------------------------------------------
 
 
 def smaller_than_joint_sis(evidence: Evidence) -> Finding:
     """Volume of JointSIS's unsafe set minus SafeMR's, in units of the true one: Welch, above 0."""
-    volumes = [_aircraft(evidence, variant, "volume_ratio") for variant in ("JointSIS", "SafeMR")]
+    volumes = [evidence.measured(variant, "volume_ratio") for variant in ("JointSIS", "SafeMR")]
     absent = [v for v, x in zip(("JointSIS", "SafeMR"), volumes, strict=True) if not len(x)]
     if absent:
-        return _missing(f"aircraft measurements of {' and '.join(absent)}")
-    return by_interval(statistics.difference_interval(*volumes), 0.0, "JointSIS - SafeMR")
+        return unavailable(f"aircraft measurements of {' and '.join(absent)}")
+    gap = statistics.difference_interval(volumes[0], volumes[1])
+    return by_interval(gap, 0.0, "JointSIS - SafeMR")
 
 
 def covers_true_set(evidence: Evidence) -> Finding:
     """Missed share of SafeMR: confirmed if its interval is at or below 1%, refuted if above."""
-    missed = _aircraft(evidence, "SafeMR", "missed_share")
+    missed = evidence.measured("SafeMR", "missed_share")
     if not len(missed):
-        return _missing("aircraft measurements of SafeMR")
-    return _at_most(statistics.mean_interval(missed), COVERS, "missed share")
+        return unavailable("aircraft measurements of SafeMR")
+    return at_most(statistics.mean_interval(missed), COVERS, "missed share")
 
 
 def handcrafted_does_not_cover(evidence: Evidence) -> Finding:
     """Missed share of phi_h, a fixed function without seeds: confirmed if above 1%."""
-    missed = _aircraft(evidence, "FAC-phih", "missed_share")
+    missed = evidence.measured("phi_h", "missed_share")
     if not len(missed):
-        return _missing("aircraft measurements of phi_h")
+        return unavailable("aircraft measurements of phi_h")
     value = float(missed.mean())
     verdict: Verdict = "confirmed" if value > COVERS else "refuted"
     return Finding(Estimate(value, value, value, 1), verdict, f"missed share {value:.3f}, computed")
@@ -155,11 +90,11 @@ def highest_safe_return(task: str, evidence: Evidence) -> Finding:
     baselines = reference.BASELINES
     absent = evidence.missing([(task, v) for v in (reference.METHOD, *baselines)])
     if absent:
-        return _missing(absent)
+        return unavailable(absent)
     ours = evidence.of(task, reference.METHOD, "eval_return")
     if not evidence.rule.is_safe(evidence.scores, task, reference.METHOD):
         cost = statistics.mean_interval(evidence.of(task, reference.METHOD, evidence.rule.cost))
-        return Finding(cost, "refuted", f"SafeMR is not safe: {_text(cost)} violating steps")
+        return Finding(cost, "refuted", f"SafeMR is not safe: {describe(cost)} violating steps")
     best, returns = best_safe_baseline(evidence.scores, task, evidence.rule, baselines)
     if not best:
         return Finding(statistics.mean_interval(ours), "confirmed", "no baseline is safe")
@@ -175,12 +110,12 @@ def zero_violations(evidence: Evidence) -> Finding:
     """
     absent = evidence.missing([(task, reference.METHOD) for task in evidence.tasks])
     if absent:
-        return _missing(absent)
+        return unavailable(absent)
     parts = {}
     for task in evidence.tasks:
         shares = evidence.of(task, reference.METHOD, evidence.rule.clean)
         estimate = statistics.mean_interval(shares)
-        shown = f"clean share {_text(estimate)}"
+        shown = f"clean share {describe(estimate)}"
         if (shares == 1).all():
             parts[task] = Finding(estimate, "confirmed", f"{shown}, no violation observed")
         elif estimate.high < 1 or estimate.mean < evidence.rule.clean_share:
@@ -198,12 +133,12 @@ def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
     """
     absent = evidence.missing([(task, variant) for task in evidence.tasks])
     if absent:
-        return _missing(absent)
+        return unavailable(absent)
     rule, parts = evidence.rule, {}
     for task in evidence.tasks:
         cost = statistics.mean_interval(evidence.of(task, variant, rule.cost))
         clean = statistics.mean_interval(evidence.of(task, variant, rule.clean))
-        shown = f"{_text(cost)} violating steps, clean share {_text(clean)}"
+        shown = f"{describe(cost)} violating steps, clean share {describe(clean)}"
         if rule.is_safe(evidence.scores, task, variant):
             parts[task] = Finding(cost, "refuted", f"{shown}: safe")
         elif cost.low > rule.tolerance or clean.high < rule.clean_share:
@@ -222,16 +157,18 @@ def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding
     names = (reference.METHOD, variant)
     absent = evidence.missing([(task, name) for task in evidence.tasks for name in names])
     if absent:
-        return _missing(absent)
+        return unavailable(absent)
     parts = {}
     for task in evidence.tasks:
         if not evidence.rule.is_safe(evidence.scores, task, variant):
             if not somewhere:
                 cost = statistics.mean_interval(evidence.of(task, variant, evidence.rule.cost))
-                parts[task] = Finding(cost, "refuted", f"{variant} is not safe: {_text(cost)} steps")
+                parts[task] = Finding(
+                    cost, "refuted", f"{variant} is not safe: {describe(cost)} steps"
+                )
             continue
         returns = [evidence.of(task, name, "eval_return") for name in names]
-        gap = statistics.difference_interval(*returns)
+        gap = statistics.difference_interval(returns[0], returns[1])
         parts[task] = by_interval(gap, 0.0, f"SafeMR - {variant}")
     if not parts:
         return Finding(NOTHING, "refuted", f"{variant} is safe on no task")
@@ -246,7 +183,7 @@ def points_beat_joint_sis(evidence: Evidence) -> Finding:
     task = reference.SENSITIVITY_TASK
     absent = _missing_points(evidence, (*evidence.points, "JointSIS"))
     if absent:
-        return _missing(absent)
+        return unavailable(absent)
     baseline = evidence.of(task, "JointSIS", "eval_return")
     return overall(
         {
@@ -263,11 +200,11 @@ def point_costs_vanish(evidence: Evidence) -> Finding:
     """For every [a, b]: violating steps of the final policy at most the tolerance, by interval."""
     absent = _missing_points(evidence, tuple(evidence.points))
     if absent:
-        return _missing(absent)
+        return unavailable(absent)
     rule = evidence.rule
     return overall(
         {
-            f"[{a:g}, {b:g}]": _at_most(
+            f"[{a:g}, {b:g}]": at_most(
                 statistics.mean_interval(
                     evidence.of(reference.SENSITIVITY_TASK, variant, rule.cost)
                 ),
@@ -293,15 +230,15 @@ def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
     if rows is not None:
         rows = rows[rows["certificate"].str.startswith(prefix)]
     if rows is None or rows.empty:
-        return _missing(f"certify results of {prefix} ...")
-    worst = rows.loc[rows["worst_margin"].idxmax()]
+        return unavailable(f"certify results of {prefix} ...")
+    worst = rows.sort_values("worst_margin").iloc[-1]
     share = float(rows["infeasible_share"].max())
     estimate = Estimate(share, np.nan, np.nan, len(rows))
     aligned = rows[["margin_inside_aligned", "margin_outside_aligned"]].to_numpy()
     drag = rows[["margin_inside_drag", "margin_outside_drag"]].to_numpy()
     shown = (
         f"{len(rows)} certificates; infeasible share up to {100 * share:.3f}% of searched states; "
-        f"analytic condition holds for {(aligned >= 0).all(1).sum()} with the aligned brake and for "
+        f"analytic condition holds for {(aligned >= 0).all(1).sum()} with the aligned brake, for "
         f"{(drag >= 0).all(1).sum()} with drag only"
     )
     if worst["worst_margin"] >= 0:
@@ -319,9 +256,11 @@ def certificate_settles_last(evidence: Evidence) -> Finding:
     minus the last of the other two. Interval above 0.
     """
     late = ("sigma", "k", "n")
-    runs = _curves(evidence, (*late, "train_return", "multiplier_mean"))
+    runs = smooth_curves(
+        evidence.progress, evidence.tasks, (*late, "train_return", "multiplier_mean")
+    )
     if not runs:
-        return _missing("SafeMR on any task")
+        return unavailable("SafeMR on any task")
     lags = []
     for curves in runs:
         settled = {
@@ -343,9 +282,9 @@ def losses_bounded(evidence: Evidence) -> Finding:
     """
     names = evidence.progress.loc[evidence.progress["variant"] == reference.METHOD, "metric"]
     metrics = [m for m in names.unique() if m.endswith(("_loss", "_grad_norm"))]
-    runs = _curves(evidence, metrics)
+    runs = smooth_curves(evidence.progress, evidence.tasks, metrics)
     if not runs:
-        return _missing("losses and gradient norms of SafeMR")
+        return unavailable("losses and gradient norms of SafeMR")
     ratios = []
     for curves in runs:
         worst = 0.0
@@ -356,7 +295,7 @@ def losses_bounded(evidence: Evidence) -> Finding:
             early = np.abs(values[~late]).max(initial=0.0)
             worst = max(worst, float(np.abs(values[late]).max() / max(early, 1e-12)))
         ratios.append(worst)
-    return _at_most(statistics.mean_interval(np.array(ratios)), GROWTH, "growth")
+    return at_most(statistics.mean_interval(np.array(ratios)), GROWTH, "growth")
 
 
 # --- the list ------------------------------------------------------------------------------------
@@ -367,17 +306,17 @@ def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
     listed = [
         Claim(
             "conservativeness", "The unsafe set learned by SafeMR is smaller than JointSIS's",
-            "difference of volumes, in units of the true unsafe set", "aircraft",
+            "difference of volumes, in units of the true unsafe set", "aircraft_frontier",
             smaller_than_joint_sis,
         ),
         Claim(
             "coverage", "SafeMR's unsafe set covers the true unsafe set",
-            "share of the true unsafe set beyond the collision disc that is missed", "aircraft",
+            "share of the true unsafe set beyond the collision disc missed", "aircraft_frontier",
             covers_true_set,
         ),
         Claim(
             "handcrafted_coverage", "The handcrafted unsafe set does not cover the true one",
-            "share of the true unsafe set beyond the collision disc that is missed", "aircraft",
+            "share of the true unsafe set beyond the collision disc missed", "aircraft_frontier",
             handcrafted_does_not_cover,
         ),
     ]  # fmt: skip
@@ -442,7 +381,7 @@ def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
             "parameters", certificate_settles_last,
         ),
         Claim(
-            "bounded", "The loss and the gradient norm do not increase much and cause no divergence",
+            "bounded", "Loss and gradient norm do not increase too much and cause no divergence",
             "largest value in the last quarter over the largest before", "parameters",
             losses_bounded,
         ),
@@ -450,7 +389,7 @@ def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
 
 
 def claims_table(evidence: Evidence) -> Table:
-    """Statement, measure, our number with its interval, verdict, reason and figure, a row a claim."""
+    """A row a claim: statement, measure, our number with its interval, verdict, why, figure."""
     rows = []
     for claim in claims(evidence.tasks):
         finding = claim.judge(evidence)
@@ -465,8 +404,10 @@ def claims_table(evidence: Evidence) -> Table:
         {
             "paper's statement": data["statement"],
             "our measure": data["measure"],
-            "ours [95% interval]": [_text(Estimate(r.estimate, r.low, r.high, r.count))
-                                    for r in data.itertuples()],
+            "ours [95% interval]": [
+                describe(Estimate(mean, low, high, 0))
+                for mean, low, high in data[["estimate", "low", "high"]].to_numpy(float)
+            ],
             "verdict": data["verdict"],
             "why": data["reason"],
             "figure": data["figure"],
@@ -479,61 +420,8 @@ def claims_table(evidence: Evidence) -> Table:
     return Table("claims", caption, data, display)
 
 
-def _at_most(estimate: Estimate, bound: float, what: str) -> Finding:
-    """Confirmed where the whole interval is at or below the bound, refuted where it is above."""
-    shown = f"{what} {_text(estimate)}"
-    if np.isnan(estimate.low):
-        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
-    if estimate.high <= bound:
-        return Finding(estimate, "confirmed", shown)
-    if estimate.low > bound:
-        return Finding(estimate, "refuted", shown)
-    return Finding(estimate, "inconclusive", f"{shown}: the interval contains {bound:g}")
-
-
-def _missing(what: str) -> Finding:
-    return Finding(NOTHING, "inconclusive", f"runs missing: {what}")
-
-
 def _missing_points(evidence: Evidence, variants: Sequence[str]) -> str:
     unknown = [p for p in reference.TABLE_II if p not in evidence.points.values()]
     texts = [f"SafeMR with [a, b] = [{a:g}, {b:g}]" for a, b in unknown]
     texts.append(evidence.missing((reference.SENSITIVITY_TASK, v) for v in variants))
     return "; ".join(text for text in texts if text)
-
-
-def _aircraft(evidence: Evidence, variant: str, metric: str) -> np.ndarray:
-    table = evidence.aircraft
-    if table is None:
-        return np.empty(0)
-    chosen = table[(table["variant"] == variant) & (table["metric"] == metric)]
-    return chosen["value"].to_numpy(float)
-
-
-def _curves(
-    evidence: Evidence, metrics: Sequence[str]
-) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Of each SafeMR run: metric -> steps and values, a trailing average over a tenth of the log."""
-    progress = evidence.progress
-    chosen = progress[
-        (progress["variant"] == reference.METHOD)
-        & progress["metric"].isin(list(metrics))
-        & progress["task"].isin(list(evidence.tasks))
-    ].dropna(subset=["value"])
-    runs = []
-    for _, run in chosen.groupby(["task", "seed"]):
-        curves = {}
-        for metric, curve in run.sort_values("step").groupby("metric"):
-            window = max(1, len(curve) // 10)
-            smooth = curve["value"].rolling(window, min_periods=1).mean().to_numpy(float)
-            curves[str(metric)] = (curve["step"].to_numpy(float), smooth)
-        runs.append(curves)
-    return runs
-
-
-def _text(estimate: Estimate) -> str:
-    if np.isnan(estimate.mean):
-        return "–"
-    if np.isnan(estimate.low) or estimate.low == estimate.high:
-        return f"{estimate.mean:.3g}"
-    return f"{estimate.mean:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]"

@@ -99,6 +99,7 @@ class Config:
     outside: Mapping[str, Outside]
     results_root: Path
     figures_root: Path
+    allow_missing: bool
     wandb_mode: str
     wandb_project: str
     cost_tolerance: float
@@ -117,7 +118,19 @@ def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None
     merged: dict[str, Any] = {}
     for path in files:
         merged |= read_yaml(Path(path))
-    return parse(merged | dict(overrides or {}))
+    return parse(merged | {key: _typed(value) for key, value in (overrides or {}).items()})
+
+
+def _typed(value: Any) -> Any:
+    """A value of ``--config``: inside lists and mappings Snakemake leaves every scalar as text."""
+    if isinstance(value, str):
+        try:
+            return yaml.load(value, _StrictLoader)
+        except yaml.YAMLError:
+            return value
+    if isinstance(value, Mapping):
+        return {key: _typed(item) for key, item in value.items()}
+    return [_typed(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -170,6 +183,7 @@ def parse(raw: Any) -> Config:
         },
         results_root=_root(top.get("results_root", "results"), "results_root"),
         figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
+        allow_missing=_flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
         wandb_project=_name(wandb.get("project", "safemr"), "wandb.project"),
         cost_tolerance=_number(safe.get("cost_tolerance", 1.0), "safe.cost_tolerance", 0, math.inf),
@@ -228,7 +242,8 @@ _StrictLoader.add_implicit_resolver(
 
 _TOP_LEVEL = (
     *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
-    *("sensitivity", "aircraft", "outside", "results_root", "figures_root", "wandb", "safe"),
+    *("sensitivity", "aircraft", "outside", "results_root", "figures_root", "allow_missing"),
+    *("wandb", "safe"),
 )
 
 
@@ -302,6 +317,12 @@ def _integer(value: Any, where: str, low: int, high: int = LARGEST_COUNT) -> int
         raise UserError(f"{where} must be an integer, not {show(value)}")
     if not low <= value <= high:
         raise UserError(f"{where} = {show(value)} must lie in [{low}, {high}]")
+    return value
+
+
+def _flag(value: Any, where: str) -> bool:
+    if not isinstance(value, bool):
+        raise UserError(f"{where} must be true or false, not {show(value)}")
     return value
 
 

@@ -124,8 +124,8 @@ def falsify(
 ) -> Falsification:
     """Search `count` Sobol states, refine the worst, confirm in the simulator.
 
-    envs: `make_simulator` of the task. Each of the `rounds` of refinement perturbs the worst states,
-    with smaller steps each time, and keeps what is worse. Raises UserError where phi stays positive
+    envs: `make_simulator` of the task. Each round of the refinement perturbs the worst states, with
+    smaller steps than the last, and keeps what is worse. Raises UserError where phi stays positive
     far from the obstacle, so that the box of states has no end.
     """
     d_min = float(envs.d_min)
@@ -195,9 +195,11 @@ def overlaps_obstacle(envs: Any, states: Array) -> NDArray[np.bool_]:
 # --- the simulator -------------------------------------------------------------------------------
 
 
-def make_simulator(task: str, num_envs: int = 128, settings: Mapping[str, Any] | None = None) -> Any:
+def make_simulator(
+    task: str, num_envs: int = 128, settings: Mapping[str, Any] | None = None
+) -> Any:
     """The task's batched environment. Raises UserError for a task without the point robot."""
-    envs = gymnasium.make_vec(
+    envs: Any = gymnasium.make_vec(
         f"envs:{task}-v0", num_envs, vectorization_mode="vector_entry_point", **(settings or {})
     )
     if "velocimeter" not in envs.observation_layout:

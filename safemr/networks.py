@@ -31,7 +31,8 @@ def _activate_(z: Tensor, activation: Activation) -> Tensor:
         return z.relu_()
     if activation == "elu":
         return torch.nn.functional.elu_(z)
-    return z.tanh_()
+    # 2 logistic(2 z) - 1: PyTorch's tanh takes twice as long as these four passes together.
+    return z.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
 
 
 def _activation_gradient(grad: Tensor, output: Tensor, activation: Activation) -> Tensor:

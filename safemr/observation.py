@@ -51,7 +51,7 @@ class ObservationTransform:
 
     @classmethod
     def for_layout(cls, layout: Mapping[str, slice]) -> ObservationTransform:
-        """For an environment's ``observation_layout``; a sensor not listed here is kept as it is."""
+        """For an environment's ``observation_layout``; an unlisted sensor is kept as it is."""
         columns: list[int] = []
         scale: list[float] = []
         clip: list[float] = []

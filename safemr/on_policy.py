@@ -142,12 +142,13 @@ class OnPolicyTrainer(ABC):
     """The loop; `safemr.training.Trainer` says what its public methods mean."""
 
     family: ClassVar[str] = "on_policy"
+    envs: Any  # the batched environment with the attributes of this repository's tasks
 
     def __init__(
         self, config: OnPolicyConfig, make_envs: MakeEnvs, seed: int, total_steps: int
     ) -> None:
         self.config, self.step = config, 0
-        self.envs: Any = make_envs(config.num_envs)
+        self.envs = make_envs(config.num_envs)
         self.transform = ObservationTransform.for_layout(self.envs.observation_layout)
         inputs, actions = self.transform.dim, int(np.prod(self.envs.single_action_space.shape))
         sizes, weights = (inputs, config.hidden, config.hidden), generator(seed, 0)
@@ -285,8 +286,8 @@ class OnPolicyTrainer(ABC):
         config, losses = self.config, []
         for _ in range(config.value_passes):
             for indices in minibatches(len(batch.actions), config.value_batch, self.order):
-                part = batch.select(indices)
-                errors = self.critics(part.observations).squeeze(-1) - part.returns
+                values = self.critics(batch.observations[indices]).squeeze(-1)
+                errors = values - batch.returns[:, indices]
                 loss = errors.square().mean(1)
                 (self.critics.parameters.grad,) = torch.autograd.grad(
                     loss.sum(), self.critics.parameters
@@ -319,4 +320,3 @@ class OnPolicyTrainer(ABC):
         self.observations = state["observations"].numpy().copy()
         self.statistics.load_state_dict(state["statistics"])
         self.envs.set_state(state["envs"])
-

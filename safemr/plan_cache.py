@@ -1,7 +1,8 @@
 """Resolving a configuration once: `snakemake -n` without importing torch or a simulator.
 
 A plan depends on the configuration and on the sources only, so it is kept in
-``<results root>/.work/plan.json`` under a key of both; only plans that passed every check get there.
+``<results root>/.work/plan.json`` under a key of both; only plans that passed every check get
+there.
 """
 
 from __future__ import annotations

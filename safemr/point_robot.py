@@ -76,9 +76,7 @@ class PointRobot:
         drag = self.damping * u / self.mass
         return drag + self.thrust / self.mass if braking == "aligned brake" else drag
 
-    def step(
-        self, pose: Array, velocity: Array, actions: Array
-    ) -> tuple[Array, Array]:
+    def step(self, pose: Array, velocity: Array, actions: Array) -> tuple[Array, Array]:
         """Pose [S, 3] = x, y, heading and velocity [S, 3] one environment step later.
 
         Semi-implicit Euler as MuJoCo does it: (M + h D) acceleration = force - D velocity - bias,

@@ -29,12 +29,12 @@ Samples = Mapping[str, np.ndarray]  # task -> [seeds] one score a run
 
 
 class Estimate(NamedTuple):
-    """A number with its interval; `low` and `high` are nan where `count` cannot support one."""
+    """A number with its interval; `low` and `high` are nan where `size` cannot support one."""
 
     mean: float
     low: float
     high: float
-    count: int
+    size: int  # independent runs
 
     @property
     def half_width(self) -> float:
@@ -63,7 +63,7 @@ def difference_interval(first: np.ndarray, second: np.ndarray, level: float = LE
     """mean(first) - mean(second) with Welch's interval for unequal variances.
 
     Seeds are treated as independent between algorithms: a common seed fixes the layouts that are
-    drawn, not the states that a policy visits. `count` is the smaller sample.
+    drawn, not the states that a policy visits. `size` is that of the smaller sample.
     """
     x, y = _finite(first), _finite(second)
     if not len(x) or not len(y):
@@ -102,7 +102,7 @@ def improvement_interval(ours: np.ndarray, baseline: np.ndarray, level: float = 
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """Mean of the middle half along the last axis: the floor(n/4) lowest and highest are dropped."""
+    """Mean of the middle half along the last axis: floor(n/4) values dropped at each end."""
     ordered = np.sort(np.asarray(values, dtype=float), axis=-1)
     cut = ordered.shape[-1] // 4
     return ordered[..., cut : ordered.shape[-1] - cut].mean(-1)
@@ -119,7 +119,7 @@ def stratified_bootstrap(
     """`statistic(samples)` with a percentile interval; seeds are resampled within each task.
 
     The statistic works along the last axis of its arrays: it gets [seeds] once and
-    [replicates, seeds] once. `count` is the smallest number of seeds of a task; with fewer than two
+    [replicates, seeds] once. `size` is the smallest number of seeds of a task; with fewer than two
     there is no interval.
     """
     point = float(statistic(samples))
@@ -251,6 +251,39 @@ def normalised_samples(
     return samples
 
 
+class Aggregates(NamedTuple):
+    """Over several tasks, by variant: performance profile, IQM, P(method > variant)."""
+
+    profiles: dict[str, pd.DataFrame]
+    iqm: dict[str, Estimate]
+    improvement: dict[str, Estimate]
+
+
+def aggregate(
+    scores: pd.DataFrame,
+    variants: Sequence[str],
+    method: str,
+    scale: Mapping[str, float],
+    thresholds: np.ndarray,
+    *,
+    metric: str = "eval_return",
+    seed: int = 0,
+) -> Aggregates:
+    """Profiles, IQM and probability of improvement of `metric` normalised by the task's `scale`.
+
+    Only variants with runs on every task of `scale` take part: aggregates over different tasks
+    cannot be compared.
+    """
+    samples = {v: normalised_samples(scores, v, metric, scale) for v in variants}
+    samples = {v: s for v, s in samples.items() if len(s) == len(scale)}
+    rivals = [v for v in samples if v != method] if method in samples else []
+    return Aggregates(
+        {v: performance_profile(s, thresholds, seed=seed) for v, s in samples.items()},
+        {v: stratified_bootstrap(s, pooled_iqm, seed=seed) for v, s in samples.items()},
+        {v: improvement_probability(samples[method], samples[v], seed=seed) for v in rivals},
+    )
+
+
 def summarise(scores: pd.DataFrame, *, seed: int = 0) -> pd.DataFrame:
     """One row per (task, variant, metric): mean, low, high (t), iqm, iqm_low, iqm_high, count."""
     rows = []
@@ -258,14 +291,14 @@ def summarise(scores: pd.DataFrame, *, seed: int = 0) -> pd.DataFrame:
         values = group["value"].to_numpy(float)
         interval = mean_interval(values)
         iqm = stratified_bootstrap({"task": values}, pooled_iqm, seed=seed)
-        rows.append((task, variant, metric, *interval[:3], *iqm[:3], interval.count))
+        rows.append((task, variant, metric, *interval[:3], *iqm[:3], interval.size))
     columns = ["task", "variant", "metric", "mean", "low", "high",
                "iqm", "iqm_low", "iqm_high", "count"]  # fmt: skip
     return pd.DataFrame(rows, columns=columns)
 
 
 def learning_curves(progress: pd.DataFrame, metric: str, *, window: int = 1) -> pd.DataFrame:
-    """Mean over seeds with its t interval against steps: task, variant, step, mean, low, high, count.
+    """Mean over seeds and its t interval: task, variant, step, mean, low, high, count.
 
     Runs may log at slightly different steps: each is interpolated linearly onto the steps of the
     shortest log of its (task, variant), and contributes only inside its own range. `window` is the
@@ -306,7 +339,7 @@ def _variance_of_mean(sample: np.ndarray) -> float:
 
 
 def _welch_t(x: np.ndarray, y: np.ndarray, ratio: float, level: float) -> float:
-    """Student quantile with the Welch-Satterthwaite degrees of freedom of mean(x) - ratio mean(y)."""
+    """Student quantile with Welch-Satterthwaite freedom of mean(x) - ratio mean(y)."""
     v1, v2 = _variance_of_mean(x), ratio**2 * _variance_of_mean(y)
     if v1 + v2 == 0:
         return 0.0

@@ -31,6 +31,7 @@ RESULT_METRICS = {
     "eval_goals": "goals",
     "minutes": "minutes",
 }
+PERCENT_DIGITS = {"eval_zero_violation_share": 1, "eval_violation_rate": 3}
 REWARD_PARTS = {
     "eval_return": "return",
     "eval_reward_approach": "approach",
@@ -60,6 +61,22 @@ class SafetyRule:
         if not len(cost) or not len(clean):
             return None
         return bool(cost.mean() <= self.tolerance and clean.mean() >= self.clean_share)
+
+    def safe_returns(self, scores: pd.DataFrame) -> pd.DataFrame:
+        """`scores` with eval_return set to 0 in every run that is not safe by itself.
+
+        The paper: "the policy is meaningless if it can not guarantee safety".
+        """
+        keys = ["task", "variant", "seed"]
+        wide = scores[scores["metric"].isin([self.cost, self.clean])]
+        wide = wide.pivot_table(index=keys, columns="metric", values="value")
+        wide = wide.reindex(columns=[self.cost, self.clean])
+        unsafe = wide[
+            ~((wide[self.cost] <= self.tolerance) & (wide[self.clean] >= self.clean_share))
+        ]
+        index = pd.MultiIndex.from_frame(scores[keys])
+        lost = index.isin(unsafe.index) & (scores["metric"] == "eval_return").to_numpy()
+        return scores.assign(value=scores["value"].where(~lost, 0.0))
 
     def __str__(self) -> str:
         return (
@@ -120,7 +137,7 @@ def table_one(
     tasks: Sequence[str] = reference.TASKS,
     baselines: Sequence[str] = reference.BASELINES,
 ) -> Table:
-    """Table I: return of SafeMR, of the best safe baseline, and the improvement, beside the paper's.
+    """Table I: returns of SafeMR and the best safe baseline, the improvement, and the paper's.
 
     scores: a score table (`statistics.final_scores`). missing: runs of the grid that have no
     record (`statistics.missing_runs`). The best baseline is chosen on the same runs that it is
@@ -186,8 +203,8 @@ def full_results(
     display = pd.DataFrame(rows, columns=["task", "algorithm", "seeds", "safe", *metrics.values()])
     caption = (
         "Full results: final performance of the deterministic policy (mean over the last 10% of "
-        "evaluations), mean over seeds ± half width of the 95% t interval; IQM in brackets. Cost is "
-        "the authors' (pillars: contact steps of the body; hazards: summed depth); any contact "
+        "evaluations), mean over seeds ± half width of the 95% t interval; IQM in brackets. Cost "
+        "is the authors' (pillars: contact steps of the body; hazards: summed depth); any contact "
         f"counts the robot's nose too. {str(rule).capitalize()}. Scripted controllers see the full "
         "state and are not learned."
     )
@@ -258,10 +275,10 @@ def _table_one_row(
     paper = reference.TABLE_I.get(task)
     return {
         "task": task,
-        "safemr": own.mean, "safemr_low": own.low, "safemr_high": own.high, "seeds": own.count,
+        "safemr": own.mean, "safemr_low": own.low, "safemr_high": own.high, "seeds": own.size,
         "safemr_safe": rule.is_safe(scores, task, reference.METHOD),
         "baseline": best, "baseline_return": other.mean,
-        "baseline_low": other.low, "baseline_high": other.high, "baseline_seeds": other.count,
+        "baseline_low": other.low, "baseline_high": other.high, "baseline_seeds": other.size,
         "improvement": gain.mean, "improvement_low": gain.low, "improvement_high": gain.high,
         "paper_safemr": paper.safemr if paper else np.nan,
         "paper_baseline": paper.best_safe if paper else np.nan,
@@ -277,17 +294,23 @@ def best_safe_baseline(
     best, returns = "", np.empty(0)
     for variant in baselines:
         values = statistics.scores_of(scores, task, variant, "eval_return")
-        if rule.is_safe(scores, task, variant) and len(values):
-            if not len(returns) or values.mean() > returns.mean():
-                best, returns = variant, values
+        better = not len(returns) or (len(values) and values.mean() > returns.mean())
+        if better and rule.is_safe(scores, task, variant):
+            best, returns = variant, values
     return best, returns
+
+
+def minutes(runs: pd.DataFrame) -> pd.DataFrame:
+    """Score rows (task, variant, seed, metric "minutes", value) from the runs' wall_s."""
+    rows = runs[["task", "variant", "seed"]].assign(metric="minutes", value=runs["wall_s"] / 60)
+    return rows.dropna(subset=["value"])
 
 
 def describe_missing(missing: pd.DataFrame) -> str:
     """ "SafeMR on Hazards-0.15-Push (seeds 3, 4); ..." from rows (task, variant, seed)."""
     groups = missing.groupby(["task", "variant"], sort=False)["seed"]
     return "; ".join(
-        f"{variant} on {task} (seeds {', '.join(map(str, seeds))})"
+        f"{variant} on {task} (seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))})"
         for (task, variant), seeds in groups
     )
 
@@ -335,9 +358,10 @@ def _summary_cell(chosen: pd.DataFrame, metric: str) -> str:
     if metric not in chosen.index:
         return ABSENT if len(chosen) else MISSING
     row = chosen.loc[metric]
-    if metric == "eval_zero_violation_share":
-        return _plus_minus(100 * row["mean"], 100 * row["low"], 100 * row["high"], 1) + "%"
-    cell = _plus_minus(row["mean"], row["low"], row["high"], 4 if metric.endswith("rate") else 2)
+    if metric in PERCENT_DIGITS:
+        mean, low, high = 100 * row[["mean", "low", "high"]].to_numpy(float)
+        return _plus_minus(mean, low, high, PERCENT_DIGITS[metric]) + "%"
+    cell = _plus_minus(row["mean"], row["low"], row["high"], 2)
     return f"{cell} [{row['iqm']:.2f}]" if metric == "eval_return" else cell
 
 

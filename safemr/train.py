@@ -83,7 +83,7 @@ def train(
     """Trains inside an open ``session``, continuing from its checkpoint where there is one.
 
     Raises UserError where the installed code is not the version that ``config`` asks for, and
-    `safemr.training.TrainingDiverged` when a quantity stops being finite.
+    `safemr.training.TrainingDivergedError` when a quantity stops being finite.
     """
     import torch
 
@@ -218,7 +218,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status (2 user error, 3 locked, 4 diverged)."""
-    from safemr.training import TrainingDiverged
+    from safemr.training import TrainingDivergedError
 
     arguments = _parse(argv)
     try:
@@ -241,7 +241,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                     label=label,
                     wandb={"mode": arguments.wandb, "project": arguments.wandb_project},
                 )
-            except TrainingDiverged as error:
+            except TrainingDivergedError as error:
+                session.fail(str(error))
                 last = int(session.rows[-1]["step"]) if session.rows else 0
                 print(
                     f"error: {label}: {error}; last good log point: step {last}; unfinished files "

@@ -14,7 +14,7 @@ from safemr.policies import Policy
 MakeEnvs = Callable[[int], gym.vector.VectorEnv]
 
 
-class TrainingDiverged(RuntimeError):
+class TrainingDivergedError(RuntimeError):
     """A quantity of the training became infinite or not a number.
 
     Attributes: ``step`` (environment steps done), ``quantity`` (its name) and ``value``.
@@ -36,7 +36,7 @@ class Trainer(Protocol):
     def advance(self, until: int) -> dict[str, float]:
         """Trains until at least ``until`` environment steps; returns the interval's metrics.
 
-        Raises TrainingDiverged.
+        Raises TrainingDivergedError.
         """
         ...
 
@@ -51,13 +51,13 @@ class Trainer(Protocol):
 
 
 def check_finite(step: int, metrics: Mapping[str, float], allowed: tuple[str, ...] = ()) -> None:
-    """Raises TrainingDiverged for the first metric that is not finite.
+    """Raises TrainingDivergedError for the first metric that is not finite.
 
     Episode statistics (``allowed`` prefixes) are nan in an interval without a finished episode.
     """
     for name, value in metrics.items():
         if not np.isfinite(value) and not name.startswith(allowed or ("train_",)):
-            raise TrainingDiverged(step, name, value)
+            raise TrainingDivergedError(step, name, value)
 
 
 def generator(seed: int, stream: int, device: str = "cpu") -> torch.Generator:

@@ -88,9 +88,9 @@ def conjugate_gradient(
 
 
 def natural_step(product: Product, gradient: Tensor, radius: float, iterations: int) -> Tensor:
-    """argmin_x gradient.x subject to x.Hx / 2 <= radius: -sqrt(2 radius / v.Hv) v, v = H^-1 gradient.
+    """argmin_x g.x subject to x.Hx / 2 <= radius: -sqrt(2 radius / v.Hv) v with v = H^-1 g.
 
-    H is given as ``product``; 0 where the gradient is 0.
+    g is the gradient [P], H is given as ``product``; the step is 0 where the gradient is 0.
     """
     direction = conjugate_gradient(product, gradient, iterations)
     curvature = dot(direction, product(direction))

@@ -158,6 +158,7 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
     ],
     ("results_root",): NOT_A_ROOT,
     ("figures_root",): NOT_A_ROOT,
+    ("allow_missing",): ["yes", 1, 0, None, [], "true"],
     ("wandb",): [None, *NOT_A_MAPPING, {"modes": "online"}],
     ("wandb", "mode"): [None, True, "on", "Online", ["online"], 3],
     ("wandb", "project"): NOT_A_NAME,
@@ -371,6 +372,9 @@ def test_later_files_replace_whole_sections(tmp_path: Path) -> None:
     overlay = tmp_path / "overlay.yaml"
     overlay.write_text("algorithms: {Mine: {algorithm: fac, critic_lr: 1e-3}}\n")
     loaded = config.load([DEFAULT, overlay], {"seeds": [7]})
+    as_text = config.load([DEFAULT], {"seeds": ["7"], "allow_missing": "true"})
+    assert as_text.seeds == (7,)
+    assert as_text.allow_missing
     assert list(loaded.algorithms) == ["Mine"]
     assert loaded.algorithms["Mine"].overrides == {"critic_lr": 0.001}
     assert loaded.seeds == (7,)

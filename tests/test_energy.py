@@ -35,7 +35,10 @@ def test_phi_0_is_the_distance_to_contact(d, d_dot, d_min):
 def test_numpy_and_torch_agree(d, d_dot, d_min, zeta):
     arrays = energy.energy(np.array([d]), np.array([d_dot]), d_min, *zeta)
     tensors = energy.energy(
-        torch.tensor([d], dtype=torch.float64), torch.tensor([d_dot], dtype=torch.float64), d_min, *zeta
+        torch.tensor([d], dtype=torch.float64),
+        torch.tensor([d_dot], dtype=torch.float64),
+        d_min,
+        *zeta,
     )
     np.testing.assert_allclose(arrays, tensors.numpy(), rtol=1e-12, atol=1e-12)
 
@@ -100,7 +103,12 @@ def test_no_loss_of_g_alone_raises_sigma(d, d_dot, d_next, d_dot_next, d_min, ze
     """dg/d sigma is n c^(n-1) > 0 where phi <= eta and 0 where phi > eta: never negative."""
     tensor = torch.tensor(zeta, dtype=torch.float64, requires_grad=True)
     phi, phi_next = (
-        energy.energy(torch.tensor(x, dtype=torch.float64), torch.tensor(v, dtype=torch.float64), d_min, *tensor.unbind())
+        energy.energy(
+            torch.tensor(x, dtype=torch.float64),
+            torch.tensor(v, dtype=torch.float64),
+            d_min,
+            *tensor.unbind(),
+        )
         for x, v in ((d, d_dot), (d_next, d_dot_next))
     )
     energy.constraint(phi, phi_next, 0.0).backward()

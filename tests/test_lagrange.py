@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -34,7 +35,7 @@ def test_never_falls_at_limit_zero(optimizer):
     for epoch in range(300):
         multiplier.update(random.exponential(5.0) if epoch % 3 else 0.0, 0.0)
         values.append(multiplier.value)
-    assert all(later >= earlier for earlier, later in zip(values, values[1:], strict=False))
+    assert all(later >= earlier for earlier, later in itertools.pairwise(values))
     assert values[-1] > values[0]
 
 
@@ -52,7 +53,7 @@ def test_at_limit_25_turns_within_the_documented_number_of_updates(violation, sl
     falls = next(k for k in range(1, len(peak)) if peak[k] < peak[k - 1])
     decayed = slack / (slack + (1.0 - 0.9**rising) * violation)
     assert falls == math.floor(math.log(decayed) / math.log(0.9)) + 1
-    assert all(b < a for a, b in zip(peak[falls:], peak[falls + 1 :], strict=False))
+    assert all(later < earlier for earlier, later in itertools.pairwise(peak[falls:]))
 
 
 def test_first_steps_of_both_optimisers():

@@ -1,4 +1,4 @@
-"""The stacked perceptrons against plain PyTorch, and the squashed Gaussian against its definition."""
+"""Stacked perceptrons against plain PyTorch, and the squashed Gaussian against its definition."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from safemr.algorithms import fac, joint_sis, safemr
 from safemr.buffers import Batch
 from safemr.errors import UserError
 from safemr.evaluate import evaluate
-from safemr.training import TrainingDiverged
+from safemr.training import TrainingDivergedError
 
 MODULES = (fac, joint_sis, safemr)
 SMALL = {
@@ -114,7 +114,9 @@ def test_certificate_losses_by_hand_and_by_gradcheck(constraint):
     multipliers = torch.linspace(0.0, 5.0, 6).double()
     config = safemr.Config(certificate_constraint=constraint, a=0.35, b=0.15)
     zeta = torch.tensor([0.3, 1.0, 2.0], dtype=torch.float64, requires_grad=True)
-    g = fac.constraint_values(batch, zeta, 0.25, dataclasses.replace(config, constraint_floor=-99.0))
+    g = fac.constraint_values(
+        batch, zeta, 0.25, dataclasses.replace(config, constraint_floor=-99.0)
+    )
     expected = {
         "floored": (multipliers * g.clamp_min(-0.001)).mean(),
         "literal": (multipliers * g).mean(),
@@ -180,7 +182,9 @@ def test_delays_of_algorithm_1():
     agent._first_update = 0
 
     def snapshot() -> dict[str, torch.Tensor]:
-        tensors = {name: getattr(agent, name).parameters for name in ("critics", "policy", "multiplier")}
+        tensors = {
+            name: getattr(agent, name).parameters for name in ("critics", "policy", "multiplier")
+        }
         return {name: t.detach().clone() for name, t in (tensors | {"zeta": agent.zeta}).items()}
 
     moved: dict[str, list[int]] = {"critics": [], "policy": [], "multiplier": [], "zeta": []}
@@ -214,7 +218,7 @@ def test_divergence_stops_at_once_and_names_the_quantity():
     trainer.advance(400)
     with torch.no_grad():
         trainer.agent.critics.parameters.fill_(math.nan)
-    with pytest.raises(TrainingDiverged, match="critic_loss became nan at step"):
+    with pytest.raises(TrainingDivergedError, match="critic_loss became nan at step"):
         trainer.advance(2000)
 
 

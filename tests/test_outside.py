@@ -119,8 +119,8 @@ def test_unknown_hyperparameter_is_named(tmp_path, record):
     config = json.loads((root / folder / records.CONFIG).read_text())
     config["algorithm"]["hyperparameters"] = {"popluation": 3}
     command = [
-        sys.executable, str(PROGRAM), "--config", records.canonical_json(config), "--variant", "CEM",
-        "--out", str(tmp_path / "out"),
+        sys.executable, str(PROGRAM), "--config", records.canonical_json(config),
+        "--variant", "CEM", "--out", str(tmp_path / "out"),
     ]  # fmt: skip
     done = subprocess.run(
         command, cwd=ROOT, env=_environment(), capture_output=True, text=True, timeout=60

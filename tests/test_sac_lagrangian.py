@@ -38,7 +38,8 @@ def test_one_multiplier_for_all_states_follows_the_mean_cost():
 
 def test_constraint_critic_bootstraps_its_own_target():
     """Its row of the targets is scale * (c - limit) + gamma * target critic, at the noise drawn."""
-    agent = Agent(Config(cost_rate_limit=0.25, constraint_scale=4.0), 3, 2, 0.1, 0, 100)
+    config = Config(cost_rate_limit=0.25, constraint_scale=4.0, backend="torch")
+    agent = Agent(config, 3, 2, 0.1, 0, 100)
     size = 6
     rows = torch.arange(float(size))
     state = torch.randn(size, 3)

@@ -51,7 +51,9 @@ class ToyEnvs(VectorEnv):
             self._random = np.random.default_rng(seed)
         self._x = self._random.uniform(-0.1, 0.1, self.num_envs)
         self._steps[:] = 0
-        return self._x[:, None].copy(), self._infos(np.zeros(self.num_envs), np.zeros(self.num_envs))
+        return self._x[:, None].copy(), self._infos(
+            np.zeros(self.num_envs), np.zeros(self.num_envs)
+        )
 
     def step(
         self, actions: np.ndarray

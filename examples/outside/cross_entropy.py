@@ -2,7 +2,7 @@
 
 It shows what any program, in any language and with any learner, must do to stand in the curves and
 tables beside the others: read a run's configuration, train, and write the record that
-docs/adding_a_baseline.md describes. It imports nothing of `safemr`, and uses the repository's
+examples/outside/README.md describes. It imports nothing of `safemr`, and uses the repository's
 environments only because the comparison is about them.
 
     python examples/outside/cross_entropy.py --config CONFIG.json --variant NAME --out FOLDER

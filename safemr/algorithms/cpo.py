@@ -1,6 +1,6 @@
 """Constrained policy optimisation (CPO).
 
-Achiam, Held, Tamar & Abbeel, "Constrained policy optimization" (arXiv:1705.10528). Each epoch solves
+Achiam, Held, Tamar & Abbeel, "Constrained policy optimization" (arXiv:1705.10528). An epoch solves
 
     min_x g.x   subject to   c + b.x <= 0   and   x.Hx / 2 <= delta,
 
@@ -12,14 +12,15 @@ the episode's length in steps, c = EpCost - cost_limit, H the Fisher matrix, del
 | the problem above (CPO, eq. 11) | `Trainer.update_policy` |
 | its dual and the feasible cases (eq. 12, theorem 2) | `solve_dual` |
 | recovery when nothing is feasible (eq. 14) | `solve_dual`, case 0 |
-| backtracking on the true constraints (section 6.1) | `trust_region.line_search`, `Trainer._accepts` |
+| backtracking (section 6.1) | `trust_region.line_search`, `Trainer._accepts` |
 | advantages and returns (GAE, eq. 16) | `rollout.gae` |
 
-Differences from the paper: the cost is an episode's undiscounted sum, as the limit is, so b is scaled
-by its length rather than by 1 / (1 - gamma); no shaping of the cost. From safety-starter-agents: the
-dual is solved geometrically (`solve_dual`), which gives c = 0 a value instead of r / c; c = 0 counts
-as feasible (case 2, not the recovery of case 1); and ``cost_tolerance`` keeps a policy that has
-reached c = 0 able to learn. The other differences are those of `trpo_lagrangian`.
+Differences from the paper: the cost is an episode's undiscounted sum, as the limit is, so b is
+scaled by its length rather than by 1 / (1 - gamma); no shaping of the cost. From
+safety-starter-agents: the dual is solved geometrically (`solve_dual`), which gives c = 0 a value
+instead of r / c; c = 0 counts as feasible (case 2, not the recovery of case 1); and
+``cost_tolerance`` keeps a policy that has reached c = 0 able to learn. The other differences are
+those of `trpo_lagrangian`.
 """
 
 from __future__ import annotations
@@ -44,14 +45,15 @@ VERSION = 1
 
 PUBLISHED: dict[str, Any] = {**on_policy.PUBLISHED, "cost_tolerance": 0.0}
 
+
 @dataclass(frozen=True)
 class Config(TrustRegionConfig, OnPolicyConfig):
     """Hyperparameters; the two parents have the shared ones."""
 
     # Predicted changes of an episode's cost below this count as none: a trust region that promises
-    # no more has no cost gradient (case 4), and the line search forgives as much. With 0 (the paper)
-    # an epoch without violations can end learning: c = 0 makes a plane of whatever noise is left in
-    # the cost critic, and the surrogate's curvature then refuses every step along that plane.
+    # no more has no cost gradient (case 4), and the line search forgives as much. With 0 (as
+    # published) an epoch without violations can end learning: c = 0 makes a plane of whatever noise
+    # is left in the cost critic, and the surrogate's curvature refuses every step along that plane.
     cost_tolerance: float = 0.01
 
     NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ("cost_tolerance",)
@@ -61,11 +63,11 @@ class Config(TrustRegionConfig, OnPolicyConfig):
 class Dual:
     """Solution of the linear-quadratic problem: x = -(along_reward v + along_cost w).
 
-    v = H^-1 g, w = H^-1 b. ``case`` is 4 (no cost gradient, feasible: plain TRPO step), 3 (the whole
-    trust region is feasible), 2 (the current policy is feasible, part of the region is), 1 (it is
-    not, part of the region is) or 0 (nothing is: the step of largest predicted decrease of the
-    cost, none without a cost gradient). ``reach`` is the largest change of the cost that the region
-    allows. The multipliers of the KL bound and of the cost are None in case 0: it has no dual.
+    v = H^-1 g, w = H^-1 b. ``case`` is 4 (no cost gradient, feasible: plain TRPO step), 3 (the
+    whole trust region is feasible), 2 (the current policy is feasible, part of the region is), 1
+    (it is not, part of the region is) or 0 (nothing is: the step of largest predicted decrease of
+    the cost, none without a cost gradient). ``reach`` is the largest change of the cost that the
+    region allows. The multipliers of the KL bound and of the cost are None in case 0: no dual.
     """
 
     case: int

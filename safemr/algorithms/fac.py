@@ -40,6 +40,8 @@ from safemr.training import generator
 
 VERSION = 1
 
+Info = dict[str, Any]  # metrics: numbers, or tensors that hold one
+
 REWARD_CRITICS = 2  # twin critics; the constraint critic is the third member of the stack
 
 
@@ -93,6 +95,7 @@ class Config:
     start_steps: int = 5_000  # random actions first,
     start_hold: int = 10  # each held for this many steps
     device: str = "cpu"
+    backend: Literal["fused", "torch"] = "fused"  # compiled kernels (CPU only), or autograd
 
     def __post_init__(self) -> None:
         positive = (
@@ -116,12 +119,14 @@ class Config:
                 f"multiplier_delay = {self.multiplier_delay} must be a multiple of policy_delay = "
                 f"{self.policy_delay}: the multiplier uses that step's policy action"
             )
-        if self.activation not in ACTIVATIONS:
-            raise UserError(f"activation = {self.activation!r}: use one of {ACTIVATIONS}")
-        if self.multiplier_action not in ("policy", "replay"):
-            raise UserError(
-                f"multiplier_action = {self.multiplier_action!r}: use 'policy' or 'replay'"
-            )
+        choices: dict[str, tuple[str, ...]] = {
+            "activation": ACTIVATIONS,
+            "multiplier_action": ("policy", "replay"),
+            "backend": ("fused", "torch"),
+        }
+        for name, known in choices.items():
+            if getattr(self, name) not in known:
+                raise UserError(f"{name} = {getattr(self, name)!r}: use one of {known}")
 
 
 def reward_target(
@@ -144,13 +149,10 @@ def constraint_values(batch: Batch, zeta: Tensor, d_min: float, config: Config) 
 
     No bootstrap: the constraint is about one step. Differentiable in zeta.
     """
-    sigma, k, n = zeta.unbind()
-    phi, phi_next = (
-        energy.largest(
-            energy.energy(*energy.scaled(d, d_dot, d_min, config.length_scale), sigma, k, n)
-        )
-        for d, d_dot in ((batch.d, batch.d_dot), (batch.d_next, batch.d_dot_next))
-    )
+    d = torch.stack((batch.d, batch.d_next))
+    d_dot = torch.stack((batch.d_dot, batch.d_dot_next))
+    lengths = energy.scaled(d, d_dot, d_min, config.length_scale)
+    phi, phi_next = energy.largest(energy.energy(*lengths, *zeta.unbind()))
     return energy.constraint(phi, phi_next, config.eta).clamp_min(config.constraint_floor)
 
 
@@ -185,150 +187,67 @@ def temperature_loss(
     return -log_temperature * (log_densities.detach().mean() + target_entropy)
 
 
-class Agent:
-    """Networks and optimisers; one call of `update` is one gradient step."""
+class Steps:
+    """The gradient steps of an `Agent` by autograd on the losses above: their definition.
 
-    def __init__(
-        self,
-        config: Config,
-        observation_dim: int,
-        action_dim: int,
-        d_min: float,
-        seed: int,
-        total_updates: int,
-    ) -> None:
-        self.config, self.d_min, self.total_updates = config, d_min, max(total_updates, 1)
-        self.updates = 0
-        weights = generator(seed, 0)
-        self.noise = generator(seed, 1, config.device)
-        self.action_dim = action_dim
+    `safemr.fused.FusedSteps` overrides every public method with compiled kernels.
+    """
 
-        def network(count: int, inputs: int, outputs: int, **kwargs: Any) -> StackedMLP:
-            sizes = (inputs, config.hidden, config.hidden, outputs)
-            return StackedMLP(
-                count,
-                sizes,
-                config.activation,
-                generator=weights,
-                device=config.device,
-                **kwargs,
-            )
-
-        both = observation_dim + action_dim
-        self.critics = network(REWARD_CRITICS + 1, both, 1)
-        self.policy = network(1, observation_dim, 2 * action_dim, output_gain=0.1)
-        self.multiplier = network(
-            1, observation_dim, 1, output_gain=0.1, output_bias=config.multiplier_bias
-        )
-        self.targets = self.critics.copy(REWARD_CRITICS)
-        self.zeta = torch.tensor([config.sigma, config.k, config.n], device=config.device)
-        self.log_temperature = torch.tensor(
-            config.initial_log_temperature, device=config.device, requires_grad=True
-        )
-        self._optimisers = {
-            "critics": self._adam(self.critics.parameters, config.critic_lr),
-            "policy": self._adam(self.policy.parameters, config.policy_lr),
-            "multiplier": self._adam(self.multiplier.parameters, config.multiplier_lr),
-            "temperature": self._adam(self.log_temperature, config.temperature_lr),
-        }
-
-    @staticmethod
-    def _adam(parameters: Tensor, lr: float) -> torch.optim.Adam:
-        return torch.optim.Adam([parameters], lr=lr, fused=True)
-
-    def _noise(self, count: int) -> Tensor:
-        return torch.randn(count, self.action_dim, generator=self.noise, device=self.config.device)
+    def __init__(self, agent: Agent) -> None:
+        self.agent = agent
 
     @torch.no_grad()
-    def act(self, observations: Tensor) -> Tensor:
-        """Exploring actions [N, A] in (-1, 1) for transformed observations [N, D]."""
-        output = self.policy(observations)[0]
-        return squashed_gaussian(output, self._noise(len(observations)))[0]
-
-    def multipliers(self, observations: Tensor) -> Tensor:
-        """lambda_xi(s) in [0, cap], [B]."""
-        raw = self.multiplier(observations)[0, :, 0]
-        return torch.nn.functional.softplus(raw).clamp_max(self.config.multiplier_cap)
-
-    def constraint_target(self, batch: Batch) -> Tensor:
-        """What the third critic regresses on, [B]; here max(g, floor), no bootstrap."""
-        return constraint_values(batch, self.zeta, self.d_min, self.config)
-
-    def update(self, drawn: Batch, parts: int, measure: bool = False) -> dict[str, Tensor]:
-        """``parts`` gradient steps (Algorithm 1), each on its share of the transitions drawn.
-
-        The regression targets of all of them are formed at once, with the networks as they are at
-        the start: the target networks move 0.5% a step, and one large product costs far less than
-        several small ones. With ``measure`` returns the metrics of the last step of each kind.
-        """
-        config = self.config
-        targets = self.critic_targets(drawn)
-        info: dict[str, Tensor] = {}
-        steps = zip(drawn.split(parts), targets.chunk(parts, 1), strict=True)
-        for batch, target in steps:
-            self._set_learning_rates()
-            self.updates += 1
-            info |= self._update_critics(batch, target, measure)
-            if self.updates % config.policy_delay == 0:
-                with_multiplier = self.updates % config.multiplier_delay == 0
-                info |= self._update_policy(batch, with_multiplier, measure)
-            info |= self.update_certificate(batch)
-        self.targets.follow(self.critics, 1.0 - (1.0 - config.polyak) ** parts)
-        return info if measure else {}
-
-    def update_certificate(self, batch: Batch) -> dict[str, Tensor]:
-        """FAC keeps zeta; JointSIS and SafeMR move it. Returns metrics."""
-        return {}
+    def sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, A] of the policy for standard normal noise, and log-densities [B]."""
+        return squashed_gaussian(self.agent.policy(observations)[0], noise)
 
     @torch.no_grad()
-    def critic_targets(self, batch: Batch) -> Tensor:
-        """What the critic stack regresses on, [3, B]: twice the soft return, then the constraint."""
-        noise = self._noise(len(batch.returns))
-        action, log_density = squashed_gaussian(self.policy(batch.bootstraps)[0], noise)
-        following = self.targets(torch.cat((batch.bootstraps, action), 1))[..., 0]
-        soft = reward_target(
-            batch.returns, batch.discounts, following, log_density, self.log_temperature.exp()
-        )
-        constraint = self.config.constraint_scale * self.constraint_target(batch)
-        return torch.stack((soft,) * REWARD_CRITICS + (constraint,))
+    def next_values(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Target critics' values [K, B] of sampled actions, and log-densities [B] of these."""
+        action, log_density = self.sample(observations, noise)
+        return self.agent.targets(torch.cat((observations, action), 1))[..., 0], log_density
 
-    def _update_critics(self, batch: Batch, target: Tensor, measure: bool) -> dict[str, Tensor]:
-        values = self.critics(torch.cat((batch.observations, batch.actions), 1))[..., 0]
+    def follow_critics(self, rate: float) -> None:
+        """Polyak averaging of the target critics."""
+        self.agent.targets.follow(self.agent.critics, rate)
+
+    def update_critics(self, batch: Batch, target: Tensor, measure: bool) -> Info:
+        """A step on `critic_loss`; target [3, B]."""
+        critics = self.agent.critics
+        values = critics(torch.cat((batch.observations, batch.actions), 1))[..., 0]
         loss = critic_loss(values, target)
-        gradient = self._step("critics", self.critics.parameters, loss)
+        gradient = self._step("critics", critics.parameters, loss)
         if not measure:
             return {}
         return {
             "critic_loss": loss.detach(),
             "critic_grad_norm": gradient.norm(),
             "value_mean": values[0].detach().mean(),
-            "violating_share": (target[REWARD_CRITICS] > 0).float().mean(),
         }
 
-    def _update_policy(
-        self, batch: Batch, with_multiplier: bool, measure: bool
-    ) -> dict[str, Tensor]:
-        config, observations = self.config, batch.observations
-        output = self.policy(observations)[0]
-        action, log_density = squashed_gaussian(output, self._noise(len(output)))
-        values = self.critics.frozen(torch.cat((observations, action), 1))[..., 0]
+    def update_policy(self, batch: Batch, with_multiplier: bool, measure: bool) -> Info:
+        """Steps on `policy_loss`, `temperature_loss` and, if asked for, `multiplier_loss`."""
+        agent, config, observations = self.agent, self.agent.config, batch.observations
+        output = agent.policy(observations)[0]
+        action, log_density = squashed_gaussian(output, agent.noise(len(output)))
+        values = agent.critics.frozen(torch.cat((observations, action), 1))[..., 0]
         constraint = values[REWARD_CRITICS] / config.constraint_scale
         with torch.set_grad_enabled(with_multiplier):
-            multipliers = self.multipliers(observations)
+            multipliers = agent.multipliers(observations)
         loss = policy_loss(
             log_density,
             values[:REWARD_CRITICS],
             constraint,
             multipliers.detach(),
-            self.log_temperature.detach().exp(),
+            agent.log_temperature.detach().exp(),
         )
-        gradient = self._step("policy", self.policy.parameters, loss)
+        gradient = self._step("policy", agent.policy.parameters, loss)
         self._step(
             "temperature",
-            self.log_temperature,
-            temperature_loss(self.log_temperature, log_density, config.target_entropy),
+            agent.log_temperature,
+            temperature_loss(agent.log_temperature, log_density, config.target_entropy),
         )
-        info: dict[str, Tensor] = {}
+        info: Info = {}
         if measure:
             info = {
                 "policy_loss": loss.detach(),
@@ -340,12 +259,10 @@ class Agent:
             }
         if with_multiplier:
             if config.multiplier_action == "replay":
-                both = torch.cat((observations, batch.actions), 1)
-                with torch.no_grad():
-                    constraint = self.critics(both)[REWARD_CRITICS, :, 0] / config.constraint_scale
+                constraint = agent.constraint_of(observations, batch.actions)
             dual = multiplier_loss(multipliers, constraint)
             gradient = self._step(
-                "multiplier", self.multiplier.parameters, dual, config.multiplier_grad_norm
+                "multiplier", agent.multiplier.parameters, dual, config.multiplier_grad_norm
             )
             if measure:
                 info["multiplier_grad_norm"] = gradient.norm()
@@ -359,20 +276,138 @@ class Agent:
         if max_norm is not None:
             gradient.mul_((max_norm / (gradient.norm() + 1e-6)).clamp_max(1.0))
         parameters.grad = gradient
-        self._optimisers[name].step()
+        self.agent.optimisers[name].step()
         return gradient
 
-    def _set_learning_rates(self) -> None:
-        config = self.config
-        share = 1.0 - (1.0 - config.lr_final) * min(self.updates / self.total_updates, 1.0)
-        start = {
-            "critics": config.critic_lr,
-            "policy": config.policy_lr,
-            "multiplier": config.multiplier_lr,
-            "temperature": config.temperature_lr,
+
+class Agent:
+    """Networks, optimisers and the order of Algorithm 1; `Steps` does the arithmetic.
+
+    What a variant may override: `critic_targets` or `constraint_target`, `multiplier_inputs`,
+    `update_certificate`, `metrics` and `extras`.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        observation_dim: int,
+        action_dim: int,
+        d_min: float,
+        seed: int,
+        total_updates: int,
+    ) -> None:
+        self.config, self.d_min, self.total_updates = config, d_min, max(total_updates, 1)
+        self.updates = 0
+        options: dict[str, Any] = {"generator": generator(seed, 0), "device": config.device}
+        self._generator = generator(seed, 1, config.device)
+        self.action_dim = action_dim
+
+        def network(count: int, inputs: int, outputs: int, **kwargs: Any) -> StackedMLP:
+            sizes = (inputs, config.hidden, config.hidden, outputs)
+            return StackedMLP(count, sizes, config.activation, **options, **kwargs)
+
+        both = observation_dim + action_dim
+        self.critics = network(REWARD_CRITICS + 1, both, 1)
+        self.policy = network(1, observation_dim, 2 * action_dim, output_gain=0.1)
+        self.multiplier = network(
+            1, observation_dim, 1, output_gain=0.1, output_bias=config.multiplier_bias
+        )
+        self.targets = self.critics.copy(REWARD_CRITICS)
+        self.zeta = torch.tensor([config.sigma, config.k, config.n], device=config.device)
+        self.log_temperature = torch.tensor(
+            config.initial_log_temperature, device=config.device, requires_grad=True
+        )
+        self.optimisers = {
+            "critics": self.adam(self.critics.parameters, config.critic_lr),
+            "policy": self.adam(self.policy.parameters, config.policy_lr),
+            "multiplier": self.adam(self.multiplier.parameters, config.multiplier_lr),
+            "temperature": self.adam(self.log_temperature, config.temperature_lr),
         }
-        for name, optimiser in self._optimisers.items():
-            optimiser.param_groups[0]["lr"] = start[name] * share
+        self.steps = self._make_steps()
+
+    @staticmethod
+    def adam(parameters: Tensor, lr: float) -> torch.optim.Adam:
+        return torch.optim.Adam([parameters], lr=lr, fused=True)
+
+    def _make_steps(self) -> Steps:
+        if self.config.backend == "torch" or self.config.device != "cpu":
+            return Steps(self)
+        # Imported here, because it needs this module, and the other backend no compiler.
+        from safemr.fused import FusedSteps
+
+        return FusedSteps(self)
+
+    def noise(self, count: int) -> Tensor:
+        """Standard normal [count, A]."""
+        size, device = (count, self.action_dim), self.config.device
+        return torch.randn(size, generator=self._generator, device=device)
+
+    def act(self, observations: Tensor) -> Tensor:
+        """Exploring actions [N, A] in (-1, 1) for transformed observations [N, D]."""
+        return self.steps.sample(observations, self.noise(len(observations)))[0]
+
+    def multiplier_inputs(self, observations: Tensor) -> Tensor:
+        """What the multiplier network sees of the state; here all of it."""
+        return observations
+
+    def multipliers(self, observations: Tensor) -> Tensor:
+        """lambda_xi(s) in [0, cap], [B]."""
+        raw = self.multiplier(self.multiplier_inputs(observations))[0, :, 0]
+        return torch.nn.functional.softplus(raw).clamp_max(self.config.multiplier_cap)
+
+    @torch.no_grad()
+    def constraint_of(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Q_phi(s, a), [B]."""
+        values = self.critics(torch.cat((observations, actions), 1))[REWARD_CRITICS, :, 0]
+        return values / self.config.constraint_scale
+
+    def constraint_target(self, batch: Batch) -> Tensor:
+        """What Q_phi regresses on, [B]; here max(g, floor), no bootstrap."""
+        return constraint_values(batch, self.zeta, self.d_min, self.config)
+
+    @torch.no_grad()
+    def critic_targets(self, batch: Batch) -> Tensor:
+        """What the critic stack regresses on, [3, B]: twice the soft return, then the constraint."""
+        noise = self.noise(len(batch.returns))
+        following, log_density = self.steps.next_values(batch.bootstraps, noise)
+        soft = reward_target(
+            batch.returns, batch.discounts, following, log_density, self.log_temperature.exp()
+        )
+        constraint = self.config.constraint_scale * self.constraint_target(batch)
+        return torch.stack((soft,) * REWARD_CRITICS + (constraint,))
+
+    def update(self, drawn: Batch, parts: int, measure: bool = False) -> Info:
+        """``parts`` gradient steps (Algorithm 1), each on its share of the transitions drawn.
+
+        The regression targets of all of them are formed at once, with the networks as they are at
+        the start: the target networks move 0.5% a step, and one large product costs far less than
+        several small ones. With ``measure`` returns the metrics of the last step of each kind.
+        """
+        config, steps = self.config, self.steps
+        targets = self.critic_targets(drawn)
+        info: Info = {}
+        for batch, target in zip(drawn.split(parts), targets.chunk(parts, 1), strict=True):
+            self._set_learning_rates()
+            self.updates += 1
+            info |= steps.update_critics(batch, target, measure)
+            if self.updates % config.policy_delay == 0:
+                with_multiplier = self.updates % config.multiplier_delay == 0
+                info |= steps.update_policy(batch, with_multiplier, measure)
+            info |= self.update_certificate(batch)
+        steps.follow_critics(1.0 - (1.0 - config.polyak) ** parts)
+        if not measure:
+            return {}
+        violating = targets[REWARD_CRITICS] > 0
+        return info | {"violating_share": violating.float().mean()}
+
+    def update_certificate(self, batch: Batch) -> Info:
+        """FAC keeps zeta; JointSIS and SafeMR move it. Returns metrics."""
+        return {}
+
+    def _set_learning_rates(self) -> None:
+        share = 1.0 - (1.0 - self.config.lr_final) * min(self.updates / self.total_updates, 1.0)
+        for optimiser in self.optimisers.values():
+            optimiser.param_groups[0]["lr"] = optimiser.defaults["lr"] * share
 
     def metrics(self) -> dict[str, float]:
         """State of the agent for the log: zeta and the temperature."""
@@ -398,23 +433,24 @@ class Agent:
         networks = ("critics", "targets", "policy", "multiplier")
         return {
             "updates": self.updates,
-            "noise": self.noise.get_state(),
+            "noise": self._generator.get_state(),
             "zeta": self.zeta.detach(),
             "log_temperature": self.log_temperature.detach(),
             "networks": {name: getattr(self, name).parameters.detach() for name in networks},
-            "optimisers": {name: o.state_dict() for name, o in self._optimisers.items()},
+            "optimisers": {name: o.state_dict() for name, o in self.optimisers.items()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.updates = int(state["updates"])
-        self.noise.set_state(state["noise"].cpu())
+        self._generator.set_state(state["noise"].cpu())
         with torch.no_grad():
             self.zeta.copy_(state["zeta"])
             self.log_temperature.copy_(state["log_temperature"])
         for name, values in state["networks"].items():
             getattr(self, name).load(values)
-        for name, optimiser in self._optimisers.items():
+        for name, optimiser in self.optimisers.items():
             optimiser.load_state_dict(state["optimisers"][name])
+        self.steps = self._make_steps()
 
 
 class Trainer(off_policy.Trainer):

@@ -91,7 +91,7 @@ class Agent(fac.Agent):
     def __init__(self, config: Config, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
         bounds = [
-            [getattr(config, f"{name}_{end}") for name in "sigma k n".split()]
+            [getattr(config, f"{name}_{end}") for name in ["sigma", "k", "n"]]
             for end in ("min", "max")
         ]
         self._low, self._high = torch.tensor(bounds, device=config.device)
@@ -104,7 +104,7 @@ class Agent(fac.Agent):
     def certificate_loss(self, batch: Batch, zeta: Tensor, multipliers: Tensor) -> Tensor:
         return certificate_loss(batch, multipliers, zeta, self.d_min, self.config)
 
-    def update_certificate(self, batch: Batch) -> dict[str, Tensor]:
+    def update_certificate(self, batch: Batch) -> fac.Info:
         """A projected gradient step on zeta every m_phi updates (Algorithm 1, last line)."""
         if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
             return {}

@@ -6,14 +6,14 @@ of Schulman et al., "Proximal policy optimization algorithms" (arXiv:1707.06347)
 | equation | function |
 |---|---|
 | L^CLIP (PPO, eq. 7) | `clipped_surrogate` |
-| (surrogate - lambda cost surrogate) / (1 + lambda) (Ray et al., section 5) | `lagrange.penalised` |
+| (surrogate - lambda cost surrogate) / (1 + lambda) (Ray et al.) | `lagrange.penalised` |
 | dual ascent on lambda (EpCost - cost_limit) | `lagrange.Multiplier` |
 | advantages and returns (GAE, eq. 16) | `rollout.gae` |
 
-Differences from the papers and from safety-starter-agents: minibatches instead of full-batch passes
-(``PUBLISHED`` restores them), orthogonal initialisation with a last policy layer of gain 0.01, fixed
-observation scaling, the early stop is checked on each minibatch before its step, and values are
-bootstrapped from the final observation of every truncated episode. The divergence is
+Differences from the papers and from safety-starter-agents: minibatches instead of full-batch
+passes (``PUBLISHED`` restores them), orthogonal initialisation with a last policy layer of gain
+0.01, fixed observation scaling, the early stop is checked on each minibatch before its step, and
+values are bootstrapped from the final observation of every truncated episode. The divergence is
 KL(pi_old || pi), in closed form.
 """
 

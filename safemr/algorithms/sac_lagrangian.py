@@ -1,7 +1,7 @@
 """SAC-Lagrangian: soft actor-critic with one multiplier on the expected discounted cost.
 
-Ha et al., "Learning to walk in the real world with minimal human effort" (arXiv:2002.08550), section
-3.2, on top of Haarnoja et al., "Soft actor-critic algorithms and applications" (arXiv:1812.05905).
+Ha et al., "Learning to walk in the real world with minimal human effort" (arXiv:2002.08550), on top
+of Haarnoja et al., "Soft actor-critic algorithms and applications" (arXiv:1812.05905).
 It is `fac` with two parts exchanged, and the example of how to add a baseline: this file and a line
 in the configuration are all of it.
 
@@ -9,7 +9,7 @@ in the configuration are all of it.
 |---|---|
 | Q_c(s, a) = E[sum_t gamma^t (c_t - cost_rate_limit)] (bootstrapped, off-policy) | `cost_target` |
 | policy loss E[alpha log pi - min_j Q_j + lambda Q_c] | `fac.policy_loss` |
-| dual ascent on lambda E[Q_c(s, pi(s))], lambda a scalar | `Agent.multipliers`, `fac.multiplier_loss` |
+| dual ascent on lambda E[Q_c(s, pi(s))] | `Agent.multiplier_inputs`, `fac.multiplier_loss` |
 
 Differences from the paper: the discounted cost of the current policy is taken at states of the
 replay memory instead of starting states, as usual off-policy; the constraint critic is not doubled.
@@ -27,7 +27,7 @@ from torch import Tensor
 from safemr.algorithms import fac
 from safemr.buffers import Batch
 from safemr.errors import UserError
-from safemr.networks import StackedMLP, squashed_gaussian
+from safemr.networks import StackedMLP
 
 VERSION = 1
 
@@ -48,7 +48,9 @@ class Config(fac.Config):
         super().__post_init__()
         for field in fields(fac.Config):
             if field.name in ENERGY_FIELDS and getattr(self, field.name) != field.default:
-                raise UserError(f"{field.name}: sac_lagrangian has no energy function; leave it out")
+                raise UserError(
+                    f"{field.name}: sac_lagrangian has no energy function; leave it out"
+                )
         if self.n_step != 1:
             raise UserError(f"n_step = {self.n_step}: sac_lagrangian needs 1")
         if self.cost_rate_limit < 0:
@@ -72,21 +74,17 @@ class Agent(fac.Agent):
         self.multiplier = StackedMLP(
             1, (0, 1), output_bias=config.multiplier_bias, device=config.device
         )
-        self._optimisers["multiplier"] = self._adam(
-            self.multiplier.parameters, config.multiplier_lr
-        )
+        self.optimisers["multiplier"] = self.adam(self.multiplier.parameters, config.multiplier_lr)
 
-    def multipliers(self, observations: Tensor) -> Tensor:
-        """The same lambda for every state, [B]."""
-        return super().multipliers(observations[:, :0])
+    def multiplier_inputs(self, observations: Tensor) -> Tensor:
+        """Nothing: the same lambda for every state."""
+        return observations[:, :0]
 
     @torch.no_grad()
     def critic_targets(self, batch: Batch) -> Tensor:
         """Twice the soft return, then the discounted cost, [3, B]."""
-        noise = self._noise(len(batch.returns))
-        action, log_density = squashed_gaussian(self.policy(batch.bootstraps)[0], noise)
-        following = self.targets(torch.cat((batch.bootstraps, action), 1))[..., 0]
-        *rewards, cost = following
+        noise = self.noise(len(batch.returns))
+        (*rewards, cost), log_density = self.steps.next_values(batch.bootstraps, noise)
         temperature = self.log_temperature.exp()
         soft = fac.reward_target(
             batch.returns, batch.discounts, torch.stack(rewards), log_density, temperature

@@ -5,14 +5,14 @@ of Schulman et al., "Trust region policy optimization" (arXiv:1502.05477).
 
 | equation | function |
 |---|---|
-| surrogate E[r A] and its bound on the mean KL (TRPO, eq. 14) | `policy_loss`, `Trainer.update_policy` |
-| natural gradient step, line search (TRPO, appendix C) | `trust_region.natural_step`, `line_search` |
-| (surrogate - lambda cost surrogate) / (1 + lambda) (Ray et al., section 5) | `lagrange.penalised` |
+| surrogate E[r A], bound on the mean KL (TRPO, eq. 14) | `policy_loss`, `Trainer.update_policy` |
+| natural gradient step, line search (appendix C) | `trust_region.natural_step`, `line_search` |
+| (surrogate - lambda cost surrogate) / (1 + lambda) (Ray et al.) | `lagrange.penalised` |
 | dual ascent on lambda (EpCost - cost_limit) | `lagrange.Multiplier` |
 | advantages and returns (GAE, eq. 16) | `rollout.gae` |
 
-Differences from the papers and from safety-starter-agents: those of `ppo_lagrangian` as far as they
-concern critics, networks and time limits; Fisher products in Gauss-Newton form, which is exact here.
+Differences from the papers and from safety-starter-agents: those of `ppo_lagrangian` as far as
+they concern critics, networks and time limits; Fisher products in Gauss-Newton form, exact here.
 """
 
 from __future__ import annotations

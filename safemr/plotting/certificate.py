@@ -40,9 +40,9 @@ def radial_drive(distance: float, d_dot: float, zeta: Zeta, d_min: float, steps:
         d, rate = path[-1]
         phi = float(energy(d, rate, d_min, *zeta))
         options = [_radial_step(d, rate, thrust) for thrust in thrusts]
-        safe = [o for o in options if constraint(phi, energy(*o, d_min, *zeta), 0.0) < 0]
+        safe = [(d, v) for d, v in options if constraint(phi, energy(d, v, d_min, *zeta), 0.0) < 0]
         path.append(safe[0] if safe and phi <= 0 else options[-1])
-        if path[0][1] < 0 < path[-1][1] and energy(*path[-1], d_min, *zeta) < -0.1:
+        if path[0][1] < 0 < path[-1][1] and energy(path[-1][0], path[-1][1], d_min, *zeta) < -0.1:
             break
     return np.array(path)
 
@@ -71,10 +71,10 @@ def energy_and_safe_set(zeta: Zeta, d_min: float) -> Figure:
     for name, (path, line) in drives.items():
         plane.plot(*path.T, color="k", ls=line, lw=1.1)
         plane.plot(*path[0], marker="o", color="k", ms=3.5)
-        middle = 4
-        plane.annotate("", path[middle + 2], path[middle], arrowprops={"arrowstyle": "->", "lw": 1})
+        plane.annotate("", path[6], path[4], arrowprops={"arrowstyle": "->", "lw": 1})
         seconds = ROBOT.step_s * np.arange(len(path))
-        time.plot(seconds, energy(*path.T, d_min, *zeta), color="k", ls=line, label=name)
+        phi_along = energy(path[:, 0], path[:, 1], d_min, *zeta)
+        time.plot(seconds, phi_along, color="k", ls=line, label=name)
     plane.set(xlabel="distance $d$ (m)", ylabel=r"rate $\dot d$ (m/s)", xlim=(0, 1.6))
     plane.grid(False)
     plane.text(d_min / 2, -0.4, "collision", rotation=90, ha="center", va="center", color="white")
@@ -169,7 +169,8 @@ def draw_requirement(zetas: Mapping[str, Zeta], d_min: float, ax: Axes) -> Axes:
         low, high = ROBOT.deceleration(np.array([place, place + 0.1]), braking)
         ax.plot(u, ROBOT.deceleration(u, braking), color="k", lw=1.2)
         ax.text(place, low, f"available: {braking}", va=where, rotation_mode="anchor",
-                rotation=np.degrees(np.arctan((high - low) / 0.1)), transform_rotates_text=True)  # fmt: skip
+                rotation=np.degrees(np.arctan((high - low) / 0.1)),
+                transform_rotates_text=True)  # fmt: skip
     for (name, zeta), tint in zip(zetas.items(), _SHADES, strict=False):
         if zeta.k > 0:
             ax.plot(u, radial_requirement(zeta, d_min, u, "inside"), color=tint, label=name)
@@ -221,39 +222,50 @@ def certificate_check(
 # --- what a trained policy's multiplier sees -----------------------------------------------------
 
 
-def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes, top: float) -> Axes:
-    """lambda(s) as shades, phi = 0 as a line; data: one scene of `rollouts.multiplier_maps`."""
-    image = ax.pcolormesh(data["x"], data["y"], data["multiplier"], cmap=_HEAT, vmin=0, vmax=top,
-                          shading="gouraud", rasterized=True)  # fmt: skip
-    ax.contour(data["x"], data["y"], data["phi"], levels=[0.0], colors="#0072B2", linewidths=1.2)
+def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
+    """lambda(s) as shades, phi = 0 as a line; data: `rollouts.multiplier_map`."""
+    top = max(float(np.nanmax(data["multiplier"])), 1e-3)
+    shades = ListedColormap(1 - np.linspace(0, 1, 256)[:, None] * (1 - np.array([0.78, 0.26, 0.0])))
+    image = ax.pcolormesh(data["x"], data["y"], data["multiplier"], cmap=shades, vmin=0, vmax=top,
+                          rasterized=True)  # fmt: skip
+    outside = np.where(np.isnan(data["multiplier"]), np.nan, data["phi"])
+    ax.contour(data["x"], data["y"], outside, levels=[0.0], colors="#0072B2", linewidths=1.3)
+    size = float(data["obstacle_size"])
     for centre in data["obstacles"]:
-        ax.add_patch(Circle(tuple(centre), float(data["d_min"]), fill=False, ec="k", ls=":", lw=0.9))
-    ax.set(aspect="equal")
+        ax.add_patch(Circle(tuple(centre), size, fc="0.35", ec="none"))
+        ax.add_patch(
+            Circle(tuple(centre), float(data["d_min"]), fill=False, ec="k", ls=":", lw=0.8)
+        )
+    goal = Circle(tuple(data["goal"]), float(data["goal_size"]), fill=False, ec="#009E73", lw=1.2)
+    ax.add_patch(goal)
+    heading, extent = float(data["heading"]), float(data["extent"])
+    start = np.array([-0.9, -0.88]) * extent
+    end = start + 0.3 * extent * np.array([np.cos(heading), np.sin(heading)])
+    ax.annotate("", tuple(end), tuple(start), arrowprops={"arrowstyle": "->", "lw": 1})
+    ax.set(aspect="equal", xticks=[-2, 0, 2], yticks=[-2, 0, 2])
     ax.grid(False)
     figure = ax.get_figure()
     assert figure is not None
-    figure.colorbar(image, ax=ax, pad=0.02, shrink=0.85)
+    figure.colorbar(image, ax=ax, location="bottom", pad=0.02, shrink=0.85, aspect=25,
+                    label=r"$\lambda(s)$")  # fmt: skip
     return ax
-
-
-_HEAT = ListedColormap(
-    np.linspace([1.0, 1.0, 1.0], [0.835, 0.369, 0.0], 256) ** np.array([1.0, 1.0, 0.8])
-)
 
 
 @style.styled
 def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence[str]) -> Figure:
-    """One panel a task: the multiplier of a trained policy and the zero level of its phi."""
-    figure = style.new_figure(style.TEXT_WIDTH, 2.1 if len(names) > 2 else 3.0)
+    """One panel a task: the multiplier of a trained policy and the zero level of its phi (blue).
+
+    The arrow is the direction of motion at every point; green: the goal; dotted: d_min.
+    """
+    figure = style.new_figure(style.TEXT_WIDTH, 2.5)
     axes = figure.subplots(1, len(names), squeeze=False)[0]
     for ax, name in zip(axes, names, strict=True):
-        if name not in scenes:
+        ax.set_title(name)
+        if name in scenes:
+            draw_multiplier_map(scenes[name], ax)
+        else:
             ax.text(0.5, 0.5, "no record", transform=ax.transAxes, ha="center", color="0.5")
-            ax.set_title(name)
-            continue
-        data = scenes[name]
-        draw_multiplier_map(data, ax, top=max(float(data["multiplier"].max()), 1e-3))
-        ax.set(title=name, xlabel="$x$ (m)")
+            ax.set(box_aspect=1, xticks=[], yticks=[])
     axes[0].set_ylabel("$y$ (m)")
     return figure
 

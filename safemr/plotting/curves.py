@@ -21,14 +21,25 @@ def draw_curves(
     *,
     looks: Mapping[str, tuple[str, object]] | None = None,
 ) -> Axes:
-    """Mean lines with shaded intervals; curves: variant, step, mean, low, high (one task)."""
+    """Mean lines with shaded intervals; curves: variant, step, mean, low, high (one task).
+
+    The view holds every mean, and intervals up to half the range of the means beyond it: two seeds
+    have t intervals of many times that, which would flatten all curves.
+    """
     for variant in style.ordered(curves["variant"].unique()):
         run = curves[curves["variant"] == variant]
         default = (style.colour(variant), style.line_style(variant))
         tint, line = (looks or {}).get(variant, default)
         ax.plot(run["step"], run["mean"], color=tint, ls=line, zorder=3)
         ax.fill_between(run["step"], run["low"], run["high"], color=tint, alpha=0.15, lw=0)
+    if len(curves):
+        bottom, top = curves["mean"].min(), curves["mean"].max()
+        reach = 0.5 * max(top - bottom, 1e-3)
+        ends = curves[["low", "high"]].fillna({"low": bottom, "high": top})
+        low, high = max(bottom - reach, ends["low"].min()), min(top + reach, ends["high"].max())
+        ax.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
     ax.margins(x=0)
+    ax.set_xlim(left=0)
     return ax
 
 
@@ -94,7 +105,7 @@ def sensitivity(
     cost_axis(axes[1])
     looks[baseline] = (style.colour(baseline), style.line_style(baseline))
     names[baseline] = style.label(baseline)
-    handles = [Line2D([], [], color=looks[v][0], ls=looks[v][1]) for v in wanted]  # type: ignore[arg-type]
+    handles = [Line2D([], [], color=looks[v][0], ls=looks[v][1]) for v in wanted]
     figure.legend(handles, [names[v] for v in wanted], loc="outside lower center", ncols=2)
     return figure
 
@@ -123,6 +134,7 @@ def parameter_evolution(
                 ax.axhline(zeta[metric], color=style.colour(variant), ls=style.line_style(variant))
             ax.set_ylabel(symbol, rotation=0, labelpad=6)
             ax.margins(x=0)
+            ax.set_xlim(left=0)
             style.thousands(ax)
         row[0].set_title(task, loc="left")
         for ax in row[1:]:

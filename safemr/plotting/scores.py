@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from safemr.plotting import style
-from safemr.statistics import Estimate
+from safemr.statistics import Aggregates, Estimate
 
 
 def draw_return_against_cost(
@@ -21,7 +22,11 @@ def draw_return_against_cost(
         ax.axvspan(-1, tolerance, color="#009E73", alpha=0.08, lw=0, zorder=0)
     for variant in style.ordered(points["variant"].unique()):
         run = points[points["variant"] == variant]
-        look = {"color": style.colour(variant), "marker": style.marker(variant), "ls": "none"}
+        look: dict[str, Any] = {
+            "color": style.colour(variant),
+            "marker": style.marker(variant),
+            "ls": "none",
+        }
         ax.plot(run["cost"], run["return"], ms=2.6, alpha=0.55, mew=0, **look)
         ax.plot(run["cost"].mean(), run["return"].mean(), ms=6, mec="white", mew=0.6, **look)
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
@@ -78,7 +83,7 @@ def draw_profiles(profiles: Mapping[str, pd.DataFrame], ax: Axes) -> Axes:
 
 def draw_intervals(estimates: Mapping[str, Estimate], ax: Axes, *, neutral: float) -> Axes:
     """Horizontal point-and-interval plot, one row a variant, with a line at the neutral value."""
-    variants = [variant for variant in style.ordered(estimates)][::-1]
+    variants = style.ordered(estimates)[::-1]
     ax.axvline(neutral, color=style.INK, lw=0.7, ls=(0, (3, 2)))
     for row, variant in enumerate(variants):
         mean, low, high, _ = estimates[variant]
@@ -94,27 +99,27 @@ def draw_intervals(estimates: Mapping[str, Estimate], ax: Axes, *, neutral: floa
 
 @style.styled
 def aggregate_scores(
-    profiles: Mapping[str, pd.DataFrame],
-    iqm: Mapping[str, Estimate],
-    improvement: Mapping[str, Estimate],
-    *,
-    method: str = "SafeMR",
+    aggregates: Aggregates, *, method: str = "SafeMR", name: str = "return"
 ) -> Figure:
-    """Profiles over all tasks, IQM of the normalised return, probability of improvement."""
+    """Performance profiles over all tasks, IQM of the normalised score, probability of improvement.
+
+    aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn.
+    """
     figure = style.new_figure(style.TEXT_WIDTH, 2.3)
     left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
-    draw_profiles(profiles, left)
-    left.set_xlabel(r"normalised return $\tau$ (paper's SafeMR $= 1$)")
-    draw_intervals(iqm, middle, neutral=1.0)
-    middle.set_xlabel("IQM of normalised return")
-    draw_intervals(improvement, right, neutral=0.5)
+    draw_profiles(aggregates.profiles, left)
+    left.set_xlabel(rf"normalised {name} $\tau$ (paper's SafeMR: 1)")
+    draw_intervals(aggregates.iqm, middle, neutral=1.0)
+    middle.set_xlabel(f"IQM of normalised {name}")
+    draw_intervals(aggregates.improvement, right, neutral=0.5)
     right.set_xlim(-0.03, 1.03)
     right.set_xlabel(rf"$P$({style.label(method)} $>$ baseline)")
     for letter, ax in zip("abc", (left, middle, right), strict=True):
         style.panel_letter(ax, letter)
     handles = [
         Line2D([], [], color=style.colour(v), ls=style.line_style(v), label=style.label(v))
-        for v in style.ordered(profiles)
+        for v in style.ordered(aggregates.profiles)
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=8)
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=8)
     return figure

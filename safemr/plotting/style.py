@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -66,7 +66,7 @@ UNSAFE = "#C44E52"  # true or actual violation
 INK = "0.25"
 
 
-styled = matplotlib.rc_context(RC)  # decorator of every function that builds a figure
+styled = matplotlib.rc_context(cast(Any, RC))  # decorator of every function that builds a figure
 
 
 def colour(variant: str) -> str:
@@ -123,7 +123,7 @@ def save(figure: Figure, stem: Path | str) -> tuple[Path, Path]:
     """Write <stem>.pdf (vector) and <stem>.png (300 dpi) without dates; returns both paths."""
     pdf, png = Path(f"{stem}.pdf"), Path(f"{stem}.png")
     pdf.parent.mkdir(parents=True, exist_ok=True)
-    with matplotlib.rc_context(RC):
+    with matplotlib.rc_context(cast(Any, RC)):
         figure.savefig(pdf, metadata={"CreationDate": None})
         figure.savefig(png, dpi=300, metadata={"Software": None})
     return pdf, png

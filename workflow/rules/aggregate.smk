@@ -1,7 +1,7 @@
 # Records -> tidy tables. Every record is verified; one that cannot be believed stops the rule.
 rule aggregate:
     input:
-        record_files(PLAN.runs),
+        record_files(RECORDED),
     output:
         runs=f"{SUMMARY}/runs.csv",
         progress=f"{SUMMARY}/progress.csv.gz",
@@ -11,9 +11,9 @@ rule aggregate:
     threads: 1
     params:
         root=RESULTS,
-        folders=sorted(RUNS),
+        folders=[run.path.as_posix() for run in RECORDED],
     message:
-        "Verifying and aggregating the records of %d runs" % len(PLAN.runs)
+        "Verifying and aggregating the records of %d runs" % len(RECORDED)
     script:
         "../scripts/aggregate.py"
 

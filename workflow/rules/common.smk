@@ -3,8 +3,6 @@ import os
 import re
 import sys
 
-from snakemake.exceptions import WorkflowError
-
 # The sources beside this Snakefile come first, here and in every job.
 sys.path.insert(0, workflow.basedir)
 os.environ["PYTHONPATH"] = os.pathsep.join(
@@ -28,11 +26,19 @@ try:
     )
     PLAN = plan_for(CONFIG)
 except UserError as error:
-    raise WorkflowError(str(error)) from None
+    sys.exit(f"error: {error}")  # one line, without the frames of a WorkflowError
 
 RESULTS, FIGURES = CONFIG.results_root.as_posix(), CONFIG.figures_root.as_posix()
 RUNS = {run.path.as_posix(): run for run in PLAN.runs}
 SUMMARY = f"{RESULTS}/summary"
+# What tables and figures are made of: everything, or with allow_missing what is there already.
+RECORDED = [
+    run
+    for run in PLAN.runs
+    if not CONFIG.allow_missing or os.path.exists(f"{RESULTS}/{run.path}/provenance.json")
+]
+if not RECORDED:
+    sys.exit("error: allow_missing is set, but none of the configured runs is recorded yet")
 LOGS = f"{RESULTS}/logs"
 TARGETS = []  # each rules file adds what `all` must make
 
@@ -40,6 +46,11 @@ TARGETS = []  # each rules file adds what `all` must make
 def record_files(runs):
     """The files of the records of some runs."""
     return [f"{RESULTS}/{run.path}/{name}" for run in runs for name in REQUIRED_FILES]
+
+
+def expected(runs):
+    """Task, variant and seed of some runs: what a table must show or call missing."""
+    return [[run.task, run.variant, run.seed] for run in runs]
 
 
 def one_of(names):

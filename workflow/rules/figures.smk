@@ -5,6 +5,7 @@ GRID = {"tasks": list(CONFIG.tasks), "variants": [*CONFIG.algorithms, *CONFIG.ou
 rule table_1:
     input:
         scores=rules.aggregate.output.scores,
+        runs=rules.aggregate.output.runs,
     output:
         expand(f"{RESULTS}/tables/table1.{{end}}", end=["csv", "tex"]),
         report(f"{RESULTS}/tables/table1.md", caption="../report/table_1.rst", category="Tables"),
@@ -14,6 +15,7 @@ rule table_1:
     threads: 1
     params:
         **GRID,
+        expected=expected((*PLAN.navigation, *PLAN.outside)),
         folder=f"{RESULTS}/tables",
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,

@@ -1,5 +1,5 @@
-# Implementations outside `safemr`: whatever writes the record (docs/adding_a_baseline.md) takes part
-# in tables and figures. One rule each; their labels, budgets and hyperparameters stand under
+# Implementations outside `safemr`: whatever writes the record (examples/outside/README.md) takes
+# part in tables and figures. One rule each; their labels, budgets and hyperparameters stand under
 # `outside` in the configuration.
 def outside_runs(algorithm):
     """The runs of the entries of `outside` that name this algorithm."""

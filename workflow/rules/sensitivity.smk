@@ -2,6 +2,7 @@
 rule sensitivity:
     input:
         progress=rules.aggregate.output.progress,
+        runs=rules.aggregate.output.runs,
     output:
         pdf=f"{FIGURES}/sensitivity.pdf",
         png=report(
@@ -15,6 +16,7 @@ rule sensitivity:
     threads: 1
     params:
         task=CONFIG.sensitivity and CONFIG.sensitivity.task,
+        expected=expected(PLAN.sensitivity),
         points={label: list(point) for label, point in PLAN.points.items()},
     script:
         "../scripts/sensitivity.py"

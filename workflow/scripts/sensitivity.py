@@ -17,5 +17,7 @@ returns, costs = (
 figure = curves.sensitivity(returns, costs, points)
 style.save(figure, Path(snakemake.output.pdf).with_suffix(""))
 learned = statistics.last_values(chosen, ("sigma", "k", "n"))
-table = tables.table_two(learned, points, task=params.task)
+expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
+missing = statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs))
+table = tables.table_two(learned, points, missing=missing, task=params.task)
 table.write(Path(snakemake.output.table[0]).parent)

@@ -1,0 +1,312 @@
+"""The aircraft experiment's numbers: every learner, and what to hold it against, as tables.
+
+A *comparison* is a DataFrame with one row per certificate (and policy, where there is one): the
+recorded runs, then fixed references. Columns: ``kind`` ("learner", "certificate", "policy"),
+``variant``, ``seed`` (-1 for references), ``sigma, k, n`` in units of ``length_scale`` metres,
+``eta`` in units of phi, `COLUMNS` of `safemr.aircraft.CertificateMetrics`, ``least_volume_ratio``
+(the frontier's at the same missed share), and those of `safemr.aircraft.Flights.summary`. What
+does not apply to a row is nan.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
+from safemr import aircraft, records, reference, statistics
+from safemr.aircraft import Truth
+from safemr.energy import constraint
+from safemr.errors import UserError
+from safemr.evaluate import Acts
+from safemr.plotting.aircraft import Slice
+from safemr.reachability import Solution
+from safemr.reachability.grid import Floats
+from safemr.tables import ABSENT, Table, describe_missing
+
+FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
+MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+# Fixed certificates, in metres. The last is where the released JointSIS code starts.
+CERTIFICATES: Mapping[str, tuple[float, float, float]] = {
+    "phi_h": reference.PHI_H,
+    "phi_0": reference.PHI_0,
+    "code init": (0.3, 1.0, 1.0),
+}
+TRUE_SET, ADVERSARIAL_SET, STRAIGHT = "true set", "true set, adversarial", "straight flight"
+COLUMNS = ("volume_ratio", "missed_share", "iou", "infeasible_share", "infeasible_share_eta",
+           "leak_share")  # fmt: skip
+
+
+class _Straight:
+    """No turn at all: how often the encounter resolves itself."""
+
+    def act(self, observations: NDArray[Any], deterministic: bool = True) -> NDArray[np.float32]:
+        return np.zeros((len(observations), 1), np.float32)
+
+
+class _Obedient:
+    """The least turn that keeps g <= 0 (Eq. cstr0, eta 0), else the one with the least g.
+
+    What a perfect learner of this certificate would do: collisions it has are the certificate's.
+    """
+
+    def __init__(self, dynamics: AircraftDynamics, phi: aircraft.Certificate) -> None:
+        self.dynamics, self.phi = dynamics, phi
+        rates = np.linspace(-dynamics.turn_limit, dynamics.turn_limit, 21)
+        self.rates = rates[np.argsort(np.abs(rates), kind="stable")]
+
+    def act(self, observations: Floats, deterministic: bool = True) -> NDArray[np.float32]:
+        x, y, cos, sin = observations.T
+        states = np.stack([x, y, np.arctan2(sin, cos)], axis=-1)
+        (b,) = self.dynamics.other_turns
+        now = self.phi(states)
+        g = np.stack(
+            [constraint(now, self.phi(self.dynamics.flow(states, a, b)), 0.0) for a in self.rates]
+        )
+        chosen = np.argmax(g <= np.maximum(g.min(axis=0), 0.0), axis=0)
+        return self.rates[chosen, None].astype(np.float32)
+
+
+def frontier_table(truth: Truth, missed_shares: Sequence[float] = MISSED_SHARES) -> pd.DataFrame:
+    """missed_share, volume_ratio, sigma, k, n (metres): the best members of the energy family."""
+    points = aircraft.frontier(truth, missed_shares)
+    rows = [(point.missed_share, point.volume_ratio, *point.zeta) for point in points]
+    return pd.DataFrame(rows, columns=["missed_share", "volume_ratio", "sigma", "k", "n"])
+
+
+def compare(
+    truth: Truth,
+    solution: Solution,
+    adversarial: Solution,
+    frontier: pd.DataFrame,
+    root: Path,
+    runs: pd.DataFrame,
+    flights: int = FLIGHTS,
+) -> pd.DataFrame:
+    """The comparison of recorded runs (rows of `records.read_records`'s index) and references.
+
+    Raises UserError naming every record whose policy file does not say what its certificate is.
+    """
+    starts = aircraft.safe_starts(solution, flights, STARTS_SEED)
+    rows = [
+        {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
+        | _certificate(truth, **saved)
+        | _flights(policy, starts, truth)
+        for run, saved, policy in _learners(root, runs)
+    ]
+    rows += [
+        {"kind": "certificate", "variant": name, "seed": -1}
+        | _certificate(truth, zeta, length_scale=1.0, eta=0.0)
+        | _flights(_obeying(truth, zeta), starts, truth)
+        for name, zeta in CERTIFICATES.items()
+    ]
+    wider = adversarial(truth.states) <= 0
+    rows += [
+        {"kind": "certificate", "variant": ADVERSARIAL_SET, "seed": -1}
+        | {"volume_ratio": float(wider.sum() / truth.unsafe.sum()), "missed_share": 0.0}
+        | {"iou": float((wider & truth.unsafe).sum() / (wider | truth.unsafe).sum())},
+        {"kind": "policy", "variant": TRUE_SET, "seed": -1}
+        | {"volume_ratio": 1.0, "missed_share": 0.0, "iou": 1.0}
+        | _flights(aircraft.OptimalEvader(solution), starts, truth),
+        {"kind": "policy", "variant": STRAIGHT, "seed": -1} | _flights(_Straight(), starts, truth),
+    ]
+    table = pd.DataFrame(rows)
+    table["covers"] = table["missed_share"] <= aircraft.COVERS
+    table["least_volume_ratio"] = np.interp(
+        table["missed_share"], frontier["missed_share"], frontier["volume_ratio"]
+    )
+    return table
+
+
+def as_scores(comparison: pd.DataFrame, task: str = "Aircraft") -> pd.DataFrame:
+    """The learners' rows as a score table: task, variant, seed, metric, value."""
+    learners = comparison[comparison["kind"] == "learner"].drop(columns=["kind", "covers"])
+    tidy = learners.melt(id_vars=["variant", "seed"], var_name="metric").dropna(subset="value")
+    return tidy.assign(task=task, value=tidy["value"].astype(float))
+
+
+def learned_zetas(comparison: pd.DataFrame, variant: str) -> list[tuple[Floats, float]]:
+    """(zeta, length_scale) of each seed of a variant."""
+    chosen = comparison[(comparison["kind"] == "learner") & (comparison["variant"] == variant)]
+    return [
+        (row[["sigma", "k", "n"]].to_numpy(float), float(row["length_scale"]))
+        for _, row in chosen.sort_values("seed").iterrows()
+    ]
+
+
+def slices(
+    solution: Solution,
+    adversarial: Solution,
+    comparison: pd.DataFrame,
+    degrees: Sequence[float] = (0, 60, 120, 180, 240, 300),
+    spacing: float = 0.1,
+) -> tuple[Floats, Floats, list[Slice]]:
+    """x [X], y [Y] over the box where encounters start, and all unsafe sets at each psi.
+
+    The learned ones are those whose zeta is trained; every set contains the disc.
+    """
+    dynamics = solution.dynamics
+    x, y = (
+        np.arange(low, high + spacing / 2, spacing)
+        for low, high in zip(BOX_LOW, BOX_HIGH, strict=True)
+    )
+    zetas = {
+        str(variant): learned_zetas(comparison, str(variant))
+        for variant in comparison["variant"].unique()
+        if not str(variant).startswith("FAC")
+    }
+
+    def claimed(states: Floats, zeta: Sequence[float] | Floats, length_scale: float) -> Floats:
+        phi = aircraft.energy_certificate(dynamics, list(zeta), length_scale)(states)
+        return np.maximum(phi, dynamics.d_min - dynamics.separation(states))
+
+    cuts = []
+    for psi in np.radians(degrees):
+        states = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
+        cuts.append(
+            Slice(
+                psi=float(psi),
+                truth=solution(states),
+                handcrafted=claimed(states, reference.PHI_H, 1.0),
+                learned={
+                    variant: [claimed(states, *learned) for learned in found]
+                    for variant, found in zetas.items()
+                    if found
+                },
+                adversarial=adversarial(states),
+            )
+        )
+    return x, y, cuts
+
+
+def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = None) -> Table:
+    """Learners (mean over seeds and half width of the 95% t interval), then the references."""
+    learners = comparison[comparison["kind"] == "learner"]
+    groups = list(learners.groupby("variant", sort=False))
+    groups += [
+        (comparison["variant"][index], comparison.loc[[index]])
+        for index in comparison.index[comparison["kind"] != "learner"]
+    ]
+    lines = []
+    for name, group in groups:
+        seeds = len(group) if (group["kind"] == "learner").any() else 0
+        certified = group["volume_ratio"].notna().any()
+        covering = int(group["covers"].sum())
+        covers = f"{covering} of {seeds}" if seeds else ("no", "yes")[covering]
+        lines.append(
+            {
+                "certificate": name,
+                "seeds": str(seeds or ABSENT),
+                "volume ratio": _cell(group["volume_ratio"], 1, 2),
+                "missed %": _cell(group["missed_share"], 100, 1),
+                "covers": covers if certified else ABSENT,
+                "IoU": _cell(group["iou"], 1, 3),
+                "least ratio": _cell(group["least_volume_ratio"], 1, 2),
+                "infeasible %": _cell(group["infeasible_share"], 100, 1),
+                "at own eta": _cell(group["infeasible_share_eta"], 100, 1),
+                "leak %": _cell(group["leak_share"], 100, 1),
+                "collisions %": _cell(group["collision_share"], 100, 2),
+                "effort": _cell(group["effort"], 1, 2),
+            }
+        )
+    caption = (
+        "Aircraft. Unsafe sets against the true one (constant traffic): volume over that of the "
+        "truth; share of the truth minus the collision disc that is missed (covers: at most "
+        f"{100 * aircraft.COVERS:g}%); least ratio: what the best [sigma, k, n] needs at the same "
+        "share missed, by interpolation; states outside the disc where no turn keeps the "
+        "constraint, with eta 0 and the learner's; states of the claimed safe set that every turn "
+        f"leaves. Deterministic policies from {FLIGHTS:,} truly safe states: flights that collide, "
+        "mean sum of a^2. The policy of a fixed certificate keeps its constraint with the least "
+        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval."
+    )
+    notes = [_verdict(as_scores(comparison))] if len(learners) else []
+    if missing is not None and len(missing):
+        notes.append(f"Runs missing: {describe_missing(missing)}.")
+    return Table("aircraft", caption, comparison, pd.DataFrame(lines), tuple(filter(None, notes)))
+
+
+def _verdict(scores: pd.DataFrame, method: str = "SafeMR", rival: str = "JointSIS") -> str:
+    """What magnitude regularization changed, with Welch's intervals; "" without both learners."""
+    texts = []
+    for metric, name, factor, unit in (
+        ("volume_ratio", "volume ratio", 1.0, ""),
+        ("missed_share", "missed share", 100.0, " points"),
+        ("iou", "IoU", 1.0, ""),
+    ):
+        ours, theirs = (
+            factor * statistics.scores_of(scores, "Aircraft", variant, metric)
+            for variant in (method, rival)
+        )
+        gap = statistics.difference_interval(ours, theirs)
+        if np.isnan(gap.mean):
+            return ""
+        interval = "" if np.isnan(gap.low) else f" [{gap.low:+.3f}, {gap.high:+.3f}]"
+        texts.append(f"{name} {gap.mean:+.3f}{interval}{unit}")
+    return f"{method} minus {rival}, Welch's 95% interval: {'; '.join(texts)}."
+
+
+def _cell(values: pd.Series, factor: float, digits: int) -> str:
+    estimate = statistics.mean_interval(factor * values.to_numpy(float))
+    if np.isnan(estimate.mean):
+        return ABSENT
+    if np.isnan(estimate.half_width):
+        return f"{estimate.mean:.{digits}f}"
+    return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
+
+
+def _learners(root: Path, runs: pd.DataFrame) -> Sequence[tuple[Any, dict[str, Any], Acts]]:
+    """(run, zeta with length_scale and eta, policy) of every record."""
+    from safemr.policies import load_policy  # torch, which reading a comparison does not need
+
+    found, lacking = [], []
+    for run in runs.itertuples():
+        folder = root / str(run.folder)
+        if not (folder / records.POLICY).is_file():
+            lacking.append(str(run.folder))
+            continue
+        policy = load_policy(folder)
+        if not {"zeta", "length_scale"} <= policy.extras.keys():
+            lacking.append(str(run.folder))
+            continue
+        config = json.loads((folder / records.CONFIG).read_text())
+        saved = {
+            "zeta": policy.extras["zeta"].astype(float),
+            "length_scale": float(policy.extras["length_scale"]),
+            "eta": float(config["algorithm"]["hyperparameters"]["eta"]),
+        }
+        found.append((run, saved, policy))
+    if lacking:
+        raise UserError(
+            f"no {records.POLICY} with zeta and length_scale in {', '.join(lacking)}: remove these "
+            "records to train them again, or take them out of aircraft.algorithms"
+        )
+    return found
+
+
+def _certificate(
+    truth: Truth, zeta: Sequence[float] | Floats, length_scale: float, eta: float
+) -> dict[str, float]:
+    phi = aircraft.energy_certificate(truth.dynamics, list(zeta), length_scale)
+    metrics = asdict(aircraft.compare_certificate(truth, phi, eta))
+    return {
+        **dict(zip(("sigma", "k", "n"), map(float, zeta), strict=True)),
+        "length_scale": length_scale,
+        "eta": eta,
+        **{name: metrics[name] for name in COLUMNS},
+    }
+
+
+def _obeying(truth: Truth, zeta: Sequence[float]) -> _Obedient:
+    return _Obedient(truth.dynamics, aircraft.energy_certificate(truth.dynamics, zeta))
+
+
+def _flights(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
+    return aircraft.fly(policy, starts, truth.dynamics).summary()

@@ -1,0 +1,146 @@
+"""What the paper's claims are judged by: evidence, findings, and the three kinds of verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+
+from safemr import reference, statistics
+from safemr.statistics import Estimate
+from safemr.tables import SafetyRule, describe_missing
+
+Verdict = Literal["confirmed", "refuted", "inconclusive"]
+
+NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything a rule may look at.
+
+    scores: score table of final evaluations (`statistics.final_scores`). progress: tidy table.
+    expected: runs (task, variant, seed) that the configured grid asks for; without it, nothing
+    counts as missing but what a rule needs and cannot find at all. points: variant -> (a, b).
+    aircraft: the comparison of `aircraft_evidence.compare`, of which variant (with phi_h for the
+    handcrafted function), volume_ratio and missed_share are used. certificates: rows of
+    `certify.certify`.
+    """
+
+    scores: pd.DataFrame
+    progress: pd.DataFrame
+    expected: pd.DataFrame | None = None
+    points: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    aircraft: pd.DataFrame | None = None
+    certificates: pd.DataFrame | None = None
+    rule: SafetyRule = field(default_factory=SafetyRule)
+    tasks: Sequence[str] = reference.TASKS
+
+    def missing(self, pairs: Iterable[tuple[str, str]]) -> str:
+        """What is missing of these (task, variant) pairs, in words; "" if nothing."""
+        runs = self.scores[["task", "variant", "seed"]].drop_duplicates()
+        present = set(zip(runs["task"], runs["variant"], strict=True))
+        texts = []
+        for task, variant in pairs:
+            if self.expected is not None:
+                wanted = self.expected
+                wanted = wanted[(wanted["task"] == task) & (wanted["variant"] == variant)]
+                absent = statistics.missing_runs(wanted, runs)
+                if len(absent):
+                    texts.append(describe_missing(absent))
+                    continue
+            if (task, variant) not in present:
+                texts.append(f"{variant} on {task} (all)")
+        return "; ".join(texts)
+
+    def of(self, task: str, variant: str, metric: str) -> np.ndarray:
+        """[seeds] final scores."""
+        return statistics.scores_of(self.scores, task, variant, metric)
+
+    def measured(self, variant: str, metric: str) -> np.ndarray:
+        """[seeds] values of a column of the aircraft comparison."""
+        if self.aircraft is None:
+            return np.empty(0)
+        rows = self.aircraft[self.aircraft["variant"] == variant]
+        return rows[metric].dropna().to_numpy(float)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One judged statement: our number, its interval, what follows and why."""
+
+    estimate: Estimate
+    verdict: Verdict
+    reason: str
+
+
+def by_interval(estimate: Estimate, threshold: float, what: str) -> Finding:
+    """Confirmed where the interval is above the threshold, refuted where below, else open."""
+    shown = f"{what} {describe(estimate)}"
+    if np.isnan(estimate.low):
+        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
+    if estimate.low > threshold:
+        return Finding(estimate, "confirmed", shown)
+    if estimate.high < threshold:
+        return Finding(estimate, "refuted", shown)
+    return Finding(estimate, "inconclusive", f"{shown}: the interval contains {threshold:g}")
+
+
+def overall(parts: Mapping[str, Finding]) -> Finding:
+    """All parts must hold: one refuted part refutes, one open part leaves it open.
+
+    The estimate is that of the part that decides; the reason names every part.
+    """
+    rank: dict[Verdict, int] = {"refuted": 0, "inconclusive": 1, "confirmed": 2}
+    deciding = min(parts.values(), key=lambda part: rank[part.verdict])
+    reason = "; ".join(f"{name}: {part.verdict}, {part.reason}" for name, part in parts.items())
+    return Finding(deciding.estimate, deciding.verdict, reason)
+
+
+def at_most(estimate: Estimate, bound: float, what: str) -> Finding:
+    """Confirmed where the whole interval is at or below the bound, refuted where it is above."""
+    shown = f"{what} {describe(estimate)}"
+    if np.isnan(estimate.low):
+        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
+    if estimate.high <= bound:
+        return Finding(estimate, "confirmed", shown)
+    if estimate.low > bound:
+        return Finding(estimate, "refuted", shown)
+    return Finding(estimate, "inconclusive", f"{shown}: the interval contains {bound:g}")
+
+
+def unavailable(what: str) -> Finding:
+    """The finding of a claim whose runs are missing."""
+    return Finding(NOTHING, "inconclusive", f"runs missing: {what}")
+
+
+def smooth_curves(
+    progress: pd.DataFrame, tasks: Sequence[str], metrics: Sequence[str]
+) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Of each SafeMR run: metric -> steps and values, averaged over a trailing tenth of the log."""
+    chosen = progress[
+        (progress["variant"] == reference.METHOD)
+        & progress["metric"].isin(list(metrics))
+        & progress["task"].isin(list(tasks))
+    ].dropna(subset=["value"])
+    runs = []
+    for _, run in chosen.groupby(["task", "seed"]):
+        curves = {}
+        for metric, curve in run.sort_values("step").groupby("metric"):
+            window = max(1, len(curve) // 10)
+            smooth = curve["value"].rolling(window, min_periods=1).mean().to_numpy(float)
+            curves[str(metric)] = (curve["step"].to_numpy(float), smooth)
+        runs.append(curves)
+    return runs
+
+
+def describe(estimate: Estimate) -> str:
+    """ "mean [low, high]", or a dash for no number."""
+    if np.isnan(estimate.mean):
+        return "–"
+    if np.isnan(estimate.low) or estimate.low == estimate.high:
+        return f"{estimate.mean:.3g}"
+    return f"{estimate.mean:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]"

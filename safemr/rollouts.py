@@ -1,0 +1,138 @@
+"""What figures need of a trained policy, computed once and kept as arrays.
+
+`episodes` records trajectories, `multiplier_map` the multiplier and the energy over a plane of
+positions. `safemr.plotting.data` writes and reads them; the figures of `safemr.plotting.scenes` and
+`.certificate` are drawn from them without torch or an environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from safemr.energy import energy, largest
+from safemr.errors import UserError
+from safemr.evaluate import Acts
+from safemr.falsification import make_simulator
+from safemr.plotting.data import GEOMETRY, Arrays
+from safemr.policies import Policy, network_from_arrays
+from safemr.reference import Zeta
+
+TOUCHED = 1e-5  # m off the free path: a contact
+
+
+def episodes(
+    policy: Acts,
+    task: str,
+    *,
+    seeds: list[int],
+    steps: int = 1000,
+    settings: Mapping[str, Any] | None = None,
+) -> Arrays:
+    """The first `steps` steps of the deterministic policy, one episode a seed.
+
+    Returns robot [T+1, N, 3] (x, y, heading), goal [T+1, N, 2], box [T+1, N, 3] (nan without a
+    box), obstacles [N, M, 2], reward [T, N], cost_indicator [T, N], goal_met [T, N], and the task's
+    geometry. The same seeds give the same layouts to every policy. Raises UserError for more steps
+    than an episode has.
+    """
+    envs = make_simulator(task, len(seeds), settings)
+    if steps > envs.max_episode_steps:
+        raise UserError(f"{task} episodes have {envs.max_episode_steps} steps, {steps} were asked")
+    observations, _ = envs.reset(seed=seeds)
+    tracks: dict[str, list[NDArray[Any]]] = {name: [] for name in ("robot", "goal", "box")}
+    scores: dict[str, list[NDArray[Any]]] = {
+        name: [] for name in ("reward", "cost_indicator", "goal_met")
+    }
+    obstacles = np.array([envs.scene(i).obstacles for i in range(len(seeds))])
+    for step in range(steps + 1):
+        # After an episode's last step the environment shows the next layout: repeat the old poses.
+        if step < envs.max_episode_steps:
+            scenes = [envs.scene(index) for index in range(len(seeds))]
+        for name, track in tracks.items():
+            track.append(np.array([_pose(getattr(scene, name)) for scene in scenes], np.float32))
+        if step < steps:
+            observations, reward, _, _, infos = envs.step(policy.act(observations))
+            scores["reward"].append(reward.astype(np.float32))
+            for name in ("cost_indicator", "goal_met"):
+                scores[name].append(infos[name].astype(np.float32))
+    stacked = {name: np.stack(rows) for name, rows in (tracks | scores).items()}
+    geometry = _geometry(envs)
+    envs.close()
+    return {**stacked, "obstacles": obstacles.astype(np.float32), **geometry}
+
+
+def multipliers(policy: Policy, observations: NDArray[Any]) -> NDArray[np.float64]:
+    """lambda_xi(s) [N] of a recorded policy, softplus and cap as in training.
+
+    Raises UserError where the policy's algorithm has no multiplier network.
+    """
+    if "multiplier_parameters" not in policy.extras:
+        raise UserError("this policy was recorded without a multiplier network")
+    network = network_from_arrays("multiplier", policy.extras)
+    with torch.no_grad():
+        raw = network(torch.from_numpy(policy.transform(observations)))[0, :, 0]
+        values = torch.nn.functional.softplus(raw)
+    cap = float(policy.extras.get("multiplier_cap", np.inf))
+    return values.clamp_max(cap).double().numpy()
+
+
+def multiplier_map(
+    policy: Policy,
+    zeta: Zeta,
+    task: str,
+    *,
+    seed: int = 0,
+    speed: float = 0.75,
+    heading: float = 0.0,
+    points: int = 81,
+    settings: Mapping[str, Any] | None = None,
+) -> Arrays:
+    """lambda(s) and phi(s) for a robot moving along `heading` at `speed`, over the task's square.
+
+    The layout is that of `seed`; the robot is put on each point of the grid, coasts for one step,
+    and the observation it then makes is evaluated. Returns x [P], y [P], multiplier [P, P] and phi
+    [P, P] (rows along y), obstacles, goal, speed, heading, geometry. The multiplier is nan inside
+    d_min and where the robot touches something, which changes its velocity.
+    """
+    envs = make_simulator(task, points, settings)
+    envs.reset(seed=[seed] * points)
+    scene, template = envs.scene(0), envs.get_state()
+    extent = float(envs.task.extent)
+    x = np.linspace(-extent, extent, points)
+    multiplier, phi = np.empty((points, points)), np.empty((points, points))
+    moved = np.empty((points, points, 2))
+    for row, y in enumerate(x):
+        state = {**template, "worlds": {k: v.copy() for k, v in template["worlds"].items()}}
+        worlds = state["worlds"]
+        worlds["start"] = np.stack([x, np.full(points, y), np.full(points, heading)], -1)
+        worlds["qpos"][:, :3], worlds["qvel"][:] = 0.0, 0.0
+        worlds["qvel"][:, 0] = speed
+        envs.set_state(state)
+        observations, *_, infos = envs.step(np.zeros((points, 2), np.float32))
+        multiplier[row] = multipliers(policy, observations)
+        phi[row] = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        multiplier[row, infos["d"].min(1) < envs.d_min] = np.nan
+        reached = np.array([envs.scene(index).robot[:2] for index in range(points)])
+        moved[row] = reached - worlds["start"][:, :2]
+    shift = np.median(moved.reshape(-1, 2), axis=0)
+    multiplier[np.abs(moved - shift).max(-1) > TOUCHED] = np.nan
+    geometry = _geometry(envs)
+    envs.close()
+    return {
+        "x": x + shift[0], "y": x + shift[1], "multiplier": multiplier, "phi": phi,
+        "obstacles": scene.obstacles, "goal": scene.goal,
+        "speed": np.array(speed), "heading": np.array(heading), **geometry,
+    }  # fmt: skip
+
+
+def _pose(values: NDArray[Any] | None) -> NDArray[Any]:
+    return np.full(3, np.nan) if values is None else np.asarray(values)
+
+
+def _geometry(envs: Any) -> Arrays:
+    return {name: np.array(getattr(envs.task, name)) for name in GEOMETRY}

@@ -1,0 +1,283 @@
+"""The aircraft experiment's tables and figures from a small fixed set of records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+import yaml
+from matplotlib.colors import to_hex
+
+from envs.aircraft import AircraftVectorEnv
+from safemr import aircraft, aircraft_evidence, config, records, runs, statistics
+from safemr.errors import UserError
+from safemr.networks import StackedMLP
+from safemr.observation import ObservationTransform
+from safemr.plotting import aircraft as pictures
+from safemr.plotting import style
+from safemr.policies import Policy
+from safemr.reachability import ADVERSARIAL, CONSTANT, Grid, Solution, solve
+
+ROOT = Path(__file__).resolve().parents[1]
+# Per variant and seed: zeta in units of five metres.
+ZETAS = {
+    ("SafeMR", 100): (0.05, 0.4, 1.0),
+    ("SafeMR", 101): (0.05, 0.5, 1.0),
+    ("JointSIS", 100): (0.06, 1.0, 1.0),
+    ("JointSIS", 101): (0.06, 0.9, 1.0),
+    ("FAC-phih", 100): (0.06, 0.2, 2.0),
+}
+FRONTIER = pd.DataFrame(
+    {"missed_share": [0.0, 0.1, 1.0], "volume_ratio": [1.9, 1.3, 0.7], "sigma": 0, "k": 1, "n": 1}
+)
+
+
+@pytest.fixture(scope="module")
+def solutions() -> tuple[Solution, Solution]:
+    grid = Grid(shape=(66, 66, 48))
+    return solve(CONSTANT, grid), solve(ADVERSARIAL, grid)
+
+
+@pytest.fixture(scope="module")
+def truth(solutions: tuple[Solution, Solution]) -> aircraft.Truth:
+    return aircraft.Truth.sample(solutions[0], log2_count=13)
+
+
+def turning(rate: float, **extras: Any) -> dict[str, np.ndarray]:
+    """The arrays of a policy that turns at a constant rate everywhere."""
+    transform = ObservationTransform.for_layout(AircraftVectorEnv.observation_layout)
+    network = StackedMLP(1, (transform.dim, 4, 2), generator=torch.Generator().manual_seed(0))
+    network.load(torch.zeros_like(network.parameters))
+    arrays = Policy(transform, network, squash=True, extras=extras).arrays()
+    weights = arrays["policy_parameters"].reshape(-1)
+    weights[-2] = np.arctanh(rate)  # bias of the mean
+    return arrays
+
+
+def write(root: Path, variant: str, seed: int, policy: dict[str, np.ndarray] | None) -> None:
+    hyperparameters = {"eta": 0.01}
+    described = {"name": "fac", "version": 1, "hyperparameters": hyperparameters}
+    run: dict[str, Any] = {
+        **{"schema": 1, "task": runs.describe_task("Aircraft", {}), "algorithm": described},
+        **{"seed": seed, "steps": 10, "log_every": 10},
+        "evaluation": {"every": 10, "episodes": 1, "seed": 0},
+    }
+    row = {"step": 10, "eval_return": 0.0, "eval_cost": 0.0, "eval_zero_violation_share": 1.0}
+    records.write_record(root / records.record_path(run, variant), run, variant, [row], {}, policy)
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]:
+    root = tmp_path_factory.mktemp("results")
+    for (variant, seed), zeta in ZETAS.items():
+        extras = {"zeta": np.array(zeta, np.float32), "length_scale": np.array(5.0)}
+        write(root, variant, seed, turning(0.5 if variant == "SafeMR" else 1e-6, **extras))
+    return root, records.read_records(root)[0]
+
+
+@pytest.fixture(scope="module")
+def comparison(
+    truth: aircraft.Truth,
+    solutions: tuple[Solution, Solution],
+    index: tuple[Path, pd.DataFrame],
+) -> pd.DataFrame:
+    return aircraft_evidence.compare(truth, *solutions, FRONTIER, *index, flights=200)
+
+
+def test_every_run_and_every_reference_has_a_row(comparison: pd.DataFrame) -> None:
+    learners = comparison[comparison["kind"] == "learner"]
+    assert set(zip(learners["variant"], learners["seed"], strict=True)) == ZETAS.keys()
+    names = set(comparison["variant"]) - {variant for variant, _ in ZETAS}
+    assert names == {
+        *aircraft_evidence.CERTIFICATES,
+        aircraft_evidence.TRUE_SET,
+        aircraft_evidence.ADVERSARIAL_SET,
+        aircraft_evidence.STRAIGHT,
+    }
+
+
+def test_a_record_in_other_units_is_the_same_certificate(comparison: pd.DataFrame) -> None:
+    """FAC-phih in units of five metres against the handcrafted one in metres."""
+    rows = comparison.set_index("variant")
+    np.testing.assert_allclose(
+        aircraft.in_metres(rows.loc["FAC-phih", ["sigma", "k", "n"]].astype(float), 5.0),
+        rows.loc["phi_h", ["sigma", "k", "n"]].astype(float),
+        rtol=1e-6,
+    )
+    for metric in ("volume_ratio", "missed_share", "iou", "infeasible_share", "leak_share"):
+        assert rows.loc["FAC-phih", metric] == pytest.approx(rows.loc["phi_h", metric], abs=1e-3)
+
+
+def test_rows_hold_what_the_measures_say(
+    comparison: pd.DataFrame, truth: aircraft.Truth, solutions: tuple[Solution, Solution]
+) -> None:
+    row = comparison[(comparison["variant"] == "JointSIS") & (comparison["seed"] == 101)].iloc[0]
+    phi = aircraft.energy_certificate(CONSTANT, np.float32(ZETAS["JointSIS", 101]).tolist(), 5.0)
+    expected = aircraft.compare_certificate(truth, phi, eta=0.01)
+    for metric in aircraft_evidence.COLUMNS:
+        assert row[metric] == getattr(expected, metric)
+    assert row["eta"] == 0.01
+    assert row["least_volume_ratio"] == pytest.approx(1.9 - 6.0 * row["missed_share"])
+    rows = comparison.set_index("variant")
+    # A constant turn of 0.5 rad/s costs 0.25 a step; no turn costs nothing and is straight flight.
+    assert rows.loc["SafeMR", "effort_per_step"].tolist() == pytest.approx([0.25, 0.25])
+    straight = rows.loc[aircraft_evidence.STRAIGHT, "collision_share"]
+    assert rows.loc["JointSIS", "collision_share"].tolist() == [straight, straight]
+    assert rows.loc[aircraft_evidence.TRUE_SET, "collision_share"] < 0.1 * straight
+    # Obeying phi_0 says to turn in the last moment; a certificate that nearly covers helps.
+    obeyed = rows.loc[["phi_0", "phi_h", "code init"], "collision_share"]
+    assert obeyed.is_monotonic_decreasing
+    assert obeyed.iloc[-1] < 0.7 * straight
+    assert 1.15 < rows.loc[aircraft_evidence.ADVERSARIAL_SET, "volume_ratio"] < 1.3
+
+
+def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
+    comparison: pd.DataFrame, index: tuple[Path, pd.DataFrame], tmp_path: Path
+) -> None:
+    expected = pd.DataFrame(
+        [("Aircraft", "SafeMR", seed) for seed in (100, 101, 102, 103)],
+        columns=["task", "variant", "seed"],
+    )
+    missing = statistics.missing_runs(expected, index[1])
+    table = aircraft_evidence.comparison_table(comparison, missing)
+    assert table.notes[-1] == "Runs missing: SafeMR on Aircraft (seeds 102, 103)."
+    shown = table.display.set_index("certificate")
+    ours = comparison[comparison["variant"] == "SafeMR"]
+    mean = statistics.mean_interval(ours["volume_ratio"].to_numpy())
+    assert shown.loc["SafeMR", "volume ratio"] == f"{mean.mean:.2f} ± {mean.half_width:.2f}"
+    assert shown.loc["SafeMR", ["seeds", "covers"]].tolist() == ["2", "0 of 2"]
+    assert shown.loc[aircraft_evidence.TRUE_SET, ["missed %", "covers"]].tolist() == [
+        "0.0",
+        "yes",
+    ]
+    gap = statistics.difference_interval(
+        *(
+            statistics.scores_of(
+                aircraft_evidence.as_scores(comparison), "Aircraft", variant, "volume_ratio"
+            )
+            for variant in ("SafeMR", "JointSIS")
+        )
+    )
+    assert (
+        f"SafeMR minus JointSIS, Welch's 95% interval: volume ratio {gap.mean:+.3f} ["
+        in (table.notes[0])
+    )
+    assert gap.mean < 0
+    for path in table.write(tmp_path):
+        assert "SafeMR" in path.read_text()
+
+
+def test_without_any_run_the_references_remain(
+    truth: aircraft.Truth, solutions: tuple[Solution, Solution], tmp_path: Path
+) -> None:
+    none = pd.DataFrame(columns=["task", "variant", "seed", "folder"])
+    comparison = aircraft_evidence.compare(truth, *solutions, FRONTIER, tmp_path, none, flights=20)
+    table = aircraft_evidence.comparison_table(comparison, none)
+    assert table.notes == ()
+    assert set(aircraft_evidence.CERTIFICATES) <= set(table.display["certificate"])
+    pictures.frontier(FRONTIER, comparison, aircraft.COVERS)
+
+
+def test_records_that_do_not_say_their_certificate_are_all_named(
+    truth: aircraft.Truth, solutions: tuple[Solution, Solution], tmp_path: Path
+) -> None:
+    write(tmp_path, "Silent", 100, None)
+    write(tmp_path, "Baseline", 101, turning(0.1))
+    index = records.read_records(tmp_path)[0]
+    with pytest.raises(UserError, match=r"zeta.*Baseline/seed101.*Silent/seed100"):
+        aircraft_evidence.compare(truth, *solutions, FRONTIER, tmp_path, index, flights=20)
+
+
+def test_frontier_table_is_the_frontier(truth: aircraft.Truth) -> None:
+    table = aircraft_evidence.frontier_table(truth, [0.1, 1.0])
+    (point, _) = aircraft.frontier(truth, [0.1, 1.0])
+    assert table.loc[0].tolist() == [0.1, point.volume_ratio, *point.zeta]
+    assert table["volume_ratio"].is_monotonic_decreasing
+
+
+def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
+    """Discs of known radius, which every boundary line must have."""
+    x, y = np.arange(-6, 6.01, 0.25), np.arange(-5, 5.01, 0.25)
+    radius = np.hypot(*np.meshgrid(x, y, indexing="ij"))
+    learned = {"SafeMR": [3.0 - radius], "JointSIS": [3.5 - radius, 3.75 - radius]}
+    cuts = [
+        pictures.Slice(psi, radius - 2.0, 1.5 - radius, learned, radius - 2.5)
+        for psi in (0.0, 1.0, 2.0, 4.0)
+    ]
+    figure = pictures.slices(x, y, cuts, d_min=1.0)
+    assert [ax.get_title() for ax in figure.axes] == [
+        rf"$\psi={degrees}\degree$" for degrees in (0, 57, 115, 229)
+    ]
+    drawn = {}
+    for line in figure.axes[0].collections:
+        points = np.concatenate([path.vertices for path in line.get_paths()])
+        if len(line.get_edgecolor()):
+            drawn.setdefault(to_hex(line.get_edgecolor()[0]), []).append(
+                float(np.hypot(*points.T).mean())
+            )
+    assert drawn[style.colour("SafeMR").lower()] == pytest.approx([3.0], abs=0.02)
+    assert drawn[style.colour("JointSIS").lower()] == pytest.approx([3.5, 3.75], abs=0.02)
+    assert sorted(drawn[pictures.TRUE.lower()])[-2:] == pytest.approx([2.0, 2.5], abs=0.02)
+    for name, made in (("slices", figure), ("one", pictures.single(x, y, cuts[2], 1.0))):
+        pdf, png = style.save(made, tmp_path / name)
+        assert pdf.read_bytes().startswith(b"%PDF")
+        assert png.stat().st_size > 10_000
+
+
+def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
+    figure = pictures.frontier(FRONTIER, comparison, aircraft.COVERS)
+    (ax,) = figure.axes
+    shown = {
+        to_hex(line.get_color()): line.get_xydata()
+        for line in ax.lines
+        if line.get_linestyle() == "None"
+    }
+    for variant in ("SafeMR", "JointSIS"):
+        rows = comparison[comparison["variant"] == variant]
+        expected = rows[["missed_share", "volume_ratio"]].to_numpy(float) * [100, 1]
+        np.testing.assert_allclose(shown[style.colour(variant).lower()], expected)
+
+
+def test_slices_hold_the_sets_of_the_comparison(
+    comparison: pd.DataFrame, solutions: tuple[Solution, Solution]
+) -> None:
+    x, y, (cut,) = aircraft_evidence.slices(*solutions, comparison, degrees=[180], spacing=0.5)
+    assert set(cut.learned) == {"SafeMR", "JointSIS"}
+    assert len(cut.learned["SafeMR"]) == 2
+    inside = np.hypot(*np.meshgrid(x, y, indexing="ij")) < CONSTANT.d_min
+    for claimed in (cut.handcrafted, *cut.learned["JointSIS"]):
+        assert (claimed[inside] > 0).all()
+    assert (cut.truth[inside] <= 0).all()
+    assert (cut.adversarial <= cut.truth + 1e-6).all()
+
+
+@pytest.mark.parametrize("name", ["config", "paper"])
+def test_shipped_learners_start_alike_and_mean_the_papers_certificates(name: str) -> None:
+    """Whatever the unit: SafeMR and JointSIS share a start, FAC has phi_h and phi_0."""
+    files = [ROOT / "config/config.yaml", ROOT / f"config/{name}.yaml"]
+    plan = runs.resolve(config.load(files))
+    zetas = {}
+    for run in plan.aircraft:
+        values = run.config["algorithm"]["hyperparameters"]
+        zeta = [values[parameter] for parameter in ("sigma", "k", "n")]
+        zetas[run.variant] = aircraft.in_metres(zeta, values["length_scale"])
+        assert values["target_entropy"] == -1.0
+    certificates = aircraft_evidence.CERTIFICATES
+    assert zetas["FAC-phih"] == pytest.approx(certificates["phi_h"])
+    assert zetas["FAC-phi0"] == pytest.approx(certificates["phi_0"])
+    for variant in zetas.keys() - {"FAC-phih", "FAC-phi0"}:
+        assert zetas[variant] == pytest.approx(certificates["code init"])
+
+
+def test_the_papers_grid_has_the_same_learners_as_the_quick_one() -> None:
+    """But for the run in metres, which shows once what the paper's a and b do unscaled."""
+    quick, paper = (
+        yaml.safe_load((ROOT / f"config/{name}.yaml").read_text())["aircraft"]["algorithms"]
+        for name in ("config", "paper")
+    )
+    quick.pop("SafeMR-metres")
+    assert quick == paper

@@ -1,0 +1,242 @@
+"""The certificate check: closed forms, the model against the simulator, replayable examples."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safemr import certify, falsification, reference
+from safemr.energy import energy
+from safemr.errors import UserError
+from safemr.falsification import ROBOT
+from safemr.feasibility import analytic_condition, radial_requirement
+from safemr.point_robot import PointRobot
+from safemr.reference import Zeta
+
+LEARNED = list(reference.TABLE_II.values())
+D_MIN = 0.25
+
+
+@pytest.fixture(scope="module", params=["Pillars-0.15-Goal", "Hazards-0.30-Push"])
+def simulator(request):
+    envs = falsification.make_simulator(request.param, 64)
+    yield envs
+    envs.close()
+
+
+@pytest.fixture(scope="module")
+def pillars():
+    envs = falsification.make_simulator("Pillars-0.15-Goal")
+    yield envs
+    envs.close()
+
+
+def random_states(count: int, seed: int = 0) -> np.ndarray:
+    low, high = [0.5, -np.pi, -np.pi, 0.0, -3.0], [1.5, np.pi, np.pi, 1.5, 3.0]
+    return np.random.default_rng(seed).uniform(low, high, (count, 5))
+
+
+# --- (a) the analytic condition ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("zeta", [*LEARNED, reference.PHI_H])
+def test_each_set_holds_with_the_aligned_brake_and_fails_with_drag_alone(zeta):
+    table = analytic_condition(zeta, D_MIN).set_index(["convention", "braking"])["holds"]
+    assert table.xs("aligned brake", level="braking").all()
+    assert not table.xs("drag only", level="braking").any()
+    assert len(table) == 4
+
+
+@pytest.mark.parametrize(
+    ("zeta", "inside", "outside"),
+    list(zip(LEARNED, [3.02, 3.35, 2.80], [3.09, 3.45, 2.85], strict=True)),
+)
+def test_requirement_at_top_speed_is_equation_three_of_issa(zeta, inside, outside):
+    """n (C + k v)^((n-1)/n) / k in 1/s, computed independently of this package."""
+    top = np.array([1.5])
+    for convention, expected in (("inside", inside), ("outside", outside)):
+        value = radial_requirement(zeta, D_MIN, top, convention) / 1.5
+        assert value == pytest.approx(expected, abs=0.005)
+
+
+@given(st.floats(0.0, 0.5), st.floats(0.3, 3.0), st.floats(1.0, 3.0), st.floats(0.1, 1.5))
+def test_requirement_is_the_one_that_stops_the_energy_from_rising(sigma, k, n, u):
+    """At phi = 0 and that deceleration, phi_dot = 0: checked with finite differences of phi."""
+    zeta = Zeta(sigma, k, n)
+    required = radial_requirement(zeta, D_MIN, np.array([u]), "inside")[0]
+    d = ((sigma + D_MIN) ** n + k * u) ** (1 / n)
+    h = 1e-6
+    rates = [energy(d - u * t, -u + required * t, D_MIN, *zeta) for t in (-h, h)]
+    assert abs((rates[1] - rates[0]) / (2 * h)) < 1e-5 * max(1.0, k * required)
+
+
+def test_eta_needs_more_deceleration():
+    plain, slack = (analytic_condition(LEARNED[0], D_MIN, eta=eta)["margin"] for eta in (0, 0.01))
+    np.testing.assert_allclose(plain - slack, 0.01 / 0.02 / LEARNED[0].k, rtol=1e-9)
+
+
+def test_an_energy_without_velocity_has_no_finite_requirement():
+    assert not analytic_condition(reference.PHI_0, D_MIN)["holds"].any()
+
+
+# --- the model and the simulator -----------------------------------------------------------------
+
+
+def test_constants_are_those_of_the_specification():
+    robot = PointRobot()
+    assert robot.mass == pytest.approx(0.00518879, rel=1e-6)
+    assert robot.inertia == pytest.approx(2.84218e-5, rel=1e-6)
+    assert robot.max_speed == pytest.approx(1.5)
+    assert robot.step_s == pytest.approx(0.02)
+    assert robot.deceleration(np.array([0.0]), "aligned brake")[0] == pytest.approx(2.89, abs=0.005)
+
+
+def test_model_equals_the_simulator_away_from_contact(simulator):
+    states, zeta = random_states(24), LEARNED[0]
+    d_min = float(simulator.d_min)
+    modelled = falsification.grid_margins(states, d_min, zeta, 0.0)
+    worlds = falsification.worlds_near_obstacle(simulator, states)
+    phi = falsification.energies(states, d_min, zeta)
+    _, simulated = falsification.simulated_grid(simulator, worlds, states[:, 4], phi, zeta, 0.0)
+    np.testing.assert_allclose(modelled, simulated, atol=1e-9)
+
+
+def test_placed_worlds_have_the_distance_and_rate_that_were_asked_for(simulator):
+    states = random_states(64, seed=1)
+    state = simulator.get_state()
+    state["worlds"] = falsification.worlds_near_obstacle(simulator, states)
+    simulator.set_state(state)
+    infos = simulator.step(np.zeros((64, 2)))[-1]
+    moved = states[:, 0] - 0.02 * states[:, 3] * np.cos(states[:, 2])
+    np.testing.assert_allclose(infos["d"][:, 0], moved, atol=2e-3)
+    np.testing.assert_allclose(
+        infos["d_dot"][:, 0], -states[:, 3] * np.cos(states[:, 2]), atol=0.15
+    )
+    others = infos["d"][:, 1:]
+    assert (others > 90).all()
+
+
+def test_action_grid_resolves_thrust_and_servo():
+    (grid,) = falsification.action_grid(np.array([2.0]))
+    assert np.abs(grid[:, 0]).max() == 0.05
+    assert np.abs(grid).max() <= 1
+    near = np.unique(grid[np.abs(grid[:, 1] - 0.6) <= 0.06 + 1e-12, 1])
+    assert len(near) >= 9
+    assert np.diff(near).max() <= 0.0151
+
+
+# --- (b) falsification ---------------------------------------------------------------------------
+
+
+def test_search_is_seeded_and_its_example_replays(pillars):
+    first, second = (
+        falsification.falsify(pillars, LEARNED[1], count=512, rounds=3) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.margin, second.margin)
+    assert first.worst_margin == second.worst_margin
+    assert first.confirmed == first.examined
+    example = json.loads(json.dumps(first.example()))
+    actions, g = falsification.replay(example)
+    assert g.min() == pytest.approx(first.worst_margin, abs=1e-12)
+    assert actions.shape == (len(g), 2)
+
+
+def test_refinement_finds_that_no_learned_set_is_feasible_everywhere(pillars):
+    result = falsification.falsify(pillars, LEARNED[0], count=1024)
+    assert result.worst_margin > 0.01
+    _distance, bearing, course, speed, turn_rate = result.worst_state
+    # sideways, closing in fast, turning as fast as the servo can
+    assert abs(np.cos(bearing)) < 0.2
+    assert np.cos(course) > 0.9
+    assert speed > 1.3
+    assert abs(turn_rate) > 2.5
+
+
+def test_distance_alone_leaks_and_a_strong_velocity_term_does_not(pillars):
+    bare = falsification.falsify(pillars, reference.PHI_0, count=2048, rounds=1)
+    assert bare.leak_share > 0.005  # too fast to stop within one step of contact
+    strong = falsification.falsify(pillars, Zeta(0.3, 3.0, 1.0), count=2048, rounds=1)
+    assert strong.leak_share == 0.0
+
+
+def test_states_inside_a_solid_obstacle_are_left_out(simulator):
+    facing = np.array([[0.27, 0.0, 0.0, 0.0, 0.0], [0.27, np.pi, 0.0, 0.0, 0.0]])
+    overlap = falsification.overlaps_obstacle(simulator, facing)
+    assert overlap.tolist() == [simulator.task.solid_obstacles, False]
+
+
+@settings(max_examples=30)
+@given(st.floats(0.0, 1.0), st.floats(0.0, 3.0), st.floats(0.5, 4.0))
+def test_searched_distances_contain_every_state_with_positive_energy(sigma, k, n):
+    zeta = Zeta(sigma, k, n)
+    if energy(D_MIN + 20.0, -1.5, D_MIN, *zeta) > 0:
+        with pytest.raises(UserError, match="no bounded search"):
+            falsification.largest_distance(zeta, D_MIN)
+        return
+    reach = falsification.largest_distance(zeta, D_MIN)
+    assert (energy(np.linspace(reach, 30, 200)[1:], -ROBOT.max_speed, D_MIN, *zeta) <= 1e-9).all()
+
+
+# --- (c) a policy --------------------------------------------------------------------------------
+
+
+class Constant:
+    def __init__(self, *action: float) -> None:
+        self.action = np.array(action, np.float32)
+
+    def act(self, observations, deterministic=True):
+        return np.tile(self.action, (len(observations), 1))
+
+
+def test_a_resting_robot_never_violates_and_a_rammer_could_have_done_otherwise():
+    task = "Pillars-0.15-Goal"
+    resting = falsification.check_policy(Constant(0, 0), task, LEARNED[0], num_envs=4, steps=20)
+    assert resting.steps == 80
+    assert resting.violating == 0
+    assert resting.avoidable_share == 0.0
+    ramming = falsification.check_policy(
+        Constant(1, 0), task, LEARNED[0], num_envs=16, steps=120, limit=20
+    )
+    assert ramming.violating > 0
+    assert ramming.examined == min(20, ramming.violating)
+    assert ramming.avoidable >= 0.8 * ramming.examined
+    assert ramming.avoidable_share <= ramming.violating_share
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def test_command_prints_four_verdicts_and_writes_table_picture_and_examples(tmp_path, capsys):
+    arguments = ["--sigma", "0.2", "--k", "0.8", "--n", "2.1", "--name", "mine",
+                 "--states", "256", "--out", str(tmp_path)]  # fmt: skip
+    assert certify.main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("holds (") == 2
+    assert printed.count("fails (") == 2
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"certificates.csv", "certificates.md", "certificates.tex",
+                     "certificates.pdf", "certificates.png", "examples.json"}  # fmt: skip
+    assert certify.main(["--replay", str(tmp_path / "examples.json")]) == 0
+    assert "mine: 100 actions" in capsys.readouterr().out
+
+
+def test_without_parameters_the_papers_certificates_are_checked():
+    names = [certificate.name for certificate in certify.paper_certificates()]
+    assert names == ["paper [0.35, 0.15]", "paper [0.45, 0.15]", "paper [0.35, 0.25]",
+                     "phi_h", "phi_0"]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "culprit"),
+    [(["--sigma", "0.2"], "--k"), (["--sigma", "-1", "--k", "1", "--n", "2"], "negative"),
+     (["--record", "x", "--k", "1"], "--record"), (["--replay", "nowhere.json"], "nowhere.json"),
+     (["--sigma", "0.3", "--k", "3", "--n", "0.1"], "no bounded search"),
+     (["--task", "Aircraft"], "point robot")],
+)  # fmt: skip
+def test_bad_requests_are_named(arguments, culprit):
+    with pytest.raises(UserError, match=culprit):
+        certify.main([*arguments, "--states", "64"])

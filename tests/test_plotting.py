@@ -1,0 +1,248 @@
+"""Figures: one colour an algorithm, the numbers that were given, files that are what they say."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from safemr import reference, statistics
+from safemr.errors import UserError
+from safemr.plotting import certificate, curves, data, scenes, scores, style
+
+TASKS = ("Pillars-0.15-Goal", "Hazards-0.15-Push")
+D_MIN = 0.25
+
+
+@pytest.fixture(scope="module")
+def progress() -> pd.DataFrame:
+    generator = np.random.default_rng(0)
+    rows = [
+        (task, variant, seed, step, metric, generator.normal(level, 0.2))
+        for task in TASKS
+        for variant, level in (("SafeMR", 2.0), ("JointSIS", 1.0), ("CPO", 3.0), ("mine", 0.5))
+        for seed in (0, 1, 2)
+        for step in (100, 200, 300)
+        for metric in ("eval_return", "eval_cost", "eval_cost_indicator", "sigma", "k", "n")
+    ]
+    return pd.DataFrame(rows, columns=["task", "variant", "seed", "step", "metric", "value"])
+
+
+def luminance(colour: str) -> np.ndarray:
+    return np.array([int(to_hex(colour)[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+
+
+def test_algorithms_have_distinct_colours_and_unknown_ones_a_stable_one():
+    names = (*reference.ALGORITHMS, "SAC-L")
+    tints = np.array([luminance(style.colour(name)) for name in names])
+    gaps = np.abs(tints[:, None] - tints[None]).sum(-1) + 3 * np.eye(len(names))
+    assert gaps.min() > 0.3
+    looks = {(style.colour(name), str(style.line_style(name)), style.marker(name))
+             for name in names}  # fmt: skip
+    assert len(looks) == len(names)
+    assert style.colour("my method") == style.colour("my method")
+    assert style.colour("my method") not in {style.colour(name) for name in names}
+
+
+def test_order_is_the_papers_then_alphabetical():
+    assert style.ordered(["zeta", "CPO", "alpha", "SafeMR"]) == ["SafeMR", "CPO", "alpha", "zeta"]
+
+
+def test_training_curves_draw_the_estimates(progress):
+    returns = statistics.learning_curves(progress, "eval_return")
+    costs = statistics.learning_curves(progress, "eval_cost")
+    figure = curves.training_curves(returns, costs, TASKS)
+    ax = figure.axes[0]
+    lines = {line.get_color(): line for line in ax.lines}
+    expected = returns[(returns["task"] == TASKS[0]) & (returns["variant"] == "SafeMR")]
+    drawn = lines[style.colour("SafeMR")].get_xydata()
+    np.testing.assert_allclose(drawn, expected[["step", "mean"]].to_numpy(float))
+    assert len(figure.axes) == 4
+    assert len(figure.legends) == 1
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert names == ["SafeMR", "JointSIS", "CPO", "mine"]
+
+
+def test_wide_intervals_do_not_flatten_the_curves():
+    table = pd.DataFrame(
+        {"variant": "SafeMR", "step": [0, 100], "mean": [0.0, 10.0], "low": [-500.0, -500.0],
+         "high": [500.0, 500.0]}
+    )  # fmt: skip
+    ax = style.new_figure(3, 2).subplots()
+    curves.draw_curves(table, ax)
+    low, high = ax.get_ylim()
+    assert -7 < low <= 0
+    assert 10 <= high < 17
+
+
+def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
+    returns = statistics.learning_curves(progress, "eval_return")
+    costs = statistics.learning_curves(progress, "eval_cost")
+    final = statistics.final_scores(progress)
+    scale = dict.fromkeys(TASKS, 1.0)
+    one = dict.fromkeys(TASKS[:1], 1.0)
+    zeta = reference.TABLE_II[reference.HEADLINE]
+    margins = pd.DataFrame(
+        {"distance": [0.3, 0.3, 0.6, 0.6], "bearing": [0.0, 1.0, 0.0, 1.0],
+         "margin": [-0.1, 0.1, -0.2, np.nan]}
+    )  # fmt: skip
+    grid = np.linspace(-1, 1, 9)
+    plane = {
+        "x": grid, "y": grid, "multiplier": np.add.outer(grid**2, grid),
+        "phi": np.outer(grid, grid), "obstacles": np.zeros((1, 2)), "goal": np.ones(2),
+        "heading": np.array(0.0), "obstacle_size": np.array(0.15), "d_min": np.array(D_MIN),
+        "goal_size": np.array(0.3), "extent": np.array(2.0),
+    }  # fmt: skip
+    return {
+        "training": lambda: curves.training_curves(returns, costs, TASKS),
+        "missing task": lambda: curves.training_curves(returns, costs, (*TASKS, "Elsewhere")),
+        "no run": lambda: curves.training_curves(returns.iloc[:0], costs.iloc[:0], TASKS),
+        "sensitivity": lambda: curves.sensitivity(
+            returns[returns["task"] == TASKS[0]], costs[costs["task"] == TASKS[0]],
+            {"SafeMR": (0.35, 0.15), "SafeMR[0.45,0.15]": (0.45, 0.15)},
+        ),
+        "parameters": lambda: curves.parameter_evolution(
+            progress, TASKS, fixed={"FAC-phih": reference.PHI_H._asdict()}
+        ),
+        "return against cost": lambda: scores.return_against_cost(final, TASKS, tolerance=1.0),
+        "aggregates": lambda: scores.aggregate_scores(
+            statistics.aggregate(final, ["SafeMR", "CPO"], "SafeMR", scale, np.linspace(0, 4, 9))
+        ),
+        "aggregates of nothing": lambda: scores.aggregate_scores(
+            statistics.aggregate(final.iloc[:0], ["SafeMR"], "SafeMR", one, np.linspace(0, 4, 9))
+        ),
+        "energy": lambda: certificate.energy_and_safe_set(zeta, D_MIN),
+        "passage": lambda: certificate.narrow_passage(
+            ("a", reference.PHI_H), ("b", zeta), D_MIN
+        ),
+        "check": lambda: certificate.certificate_check(
+            {"phi_h": reference.PHI_H, "phi_0": reference.PHI_0}, D_MIN, margins, "phi_h"
+        ),
+        "multiplier": lambda: certificate.multiplier_maps({"t": plane}, ["t", "absent"]),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(figures(pd.DataFrame(
+    columns=["task", "variant", "seed", "step", "metric", "value"]))))  # fmt: skip
+def test_figures_are_vector_and_pixels_at_print_width(progress, tmp_path, name):
+    figure = figures(progress)[name]()
+    assert figure.get_figwidth() in (
+        style.COLUMN_WIDTH, style.TEXT_WIDTH, pytest.approx(0.8 * style.TEXT_WIDTH)
+    )  # fmt: skip
+    pdf, png = style.save(figure, tmp_path / "figure")
+    content = pdf.read_bytes()
+    assert content.startswith(b"%PDF")
+    assert b"CreationDate" not in content
+    width, _ = struct.unpack(">II", png.read_bytes()[16:24])
+    assert width == pytest.approx(300 * figure.get_figwidth(), abs=1)
+
+
+def test_saving_twice_gives_equal_files(progress, tmp_path):
+    final = statistics.final_scores(progress)
+    pairs = [style.save(scores.return_against_cost(final, TASKS), tmp_path / name) for name in "ab"]
+    for first, second in zip(*pairs, strict=True):
+        assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_task_without_records_says_so(progress):
+    figure = figures(progress)["missing task"]()
+    texts = [text.get_text() for text in figure.axes[2].texts]
+    assert texts == ["no record: all runs"]
+
+
+# --- what the certificate figures compute --------------------------------------------------------
+
+
+def test_admissible_speed_is_where_the_energy_vanishes():
+    """Straight at one obstacle with phi_h: (0.55^2 - d^2) + v = 0 gives v = d^2 - 0.55^2."""
+    distances = np.array([0.5, 0.6, 0.8, 3.0])
+    positions = np.stack([-distances, np.zeros(4)], -1)
+    speed = certificate.admissible_speed(
+        positions, np.zeros((1, 2)), reference.PHI_H, D_MIN, np.array([1.0, 0.0])
+    )
+    np.testing.assert_allclose(speed, [np.nan, 0.36 - 0.3025, 0.64 - 0.3025, 1.5], atol=1e-12)
+    away = certificate.admissible_speed(
+        -positions[1:], np.zeros((1, 2)), reference.PHI_H, D_MIN, np.array([1.0, 0.0])
+    )
+    np.testing.assert_allclose(away, 1.5)
+
+
+def test_narrow_passage_is_closed_by_the_handcrafted_function_and_open_to_the_learned_one():
+    obstacles, ahead = np.array([[0.0, 0.5], [0.0, -0.5]]), np.array([1.0, 0.0])
+    line = np.stack([np.linspace(-1, 0, 201), np.zeros(201)], -1)
+    learned = reference.TABLE_II[reference.HEADLINE]
+    closed, opened = (
+        certificate.admissible_speed(line, obstacles, zeta, D_MIN, ahead)
+        for zeta in (reference.PHI_H, learned)
+    )
+    assert np.isnan(closed).any()
+    assert np.nanmin(opened) > 0.2
+    assert not np.isnan(opened).any()
+
+
+def test_radial_drives_show_both_conditions():
+    from safemr.energy import energy
+
+    zeta = reference.TABLE_II[reference.HEADLINE]
+    inside = certificate.radial_drive(1.55, -1.0, zeta, D_MIN, 100)
+    assert (energy(*inside.T, D_MIN, *zeta) <= 0).all()
+    assert (inside[:, 0] > D_MIN).all()
+    outside = energy(*certificate.radial_drive(0.7, -0.8, zeta, D_MIN, 100).T, D_MIN, *zeta)
+    assert outside[0] > 0
+    assert outside[-1] <= 0
+    assert (np.diff(outside[outside > 0]) < 0).all()
+
+
+# --- scenes --------------------------------------------------------------------------------------
+
+
+def recording(offset: float) -> dict[str, np.ndarray]:
+    time = np.linspace(0, 1, 21, dtype=np.float32)
+    robot = np.zeros((21, 2, 3), np.float32)
+    robot[..., 0] = time[:, None] + offset
+    return {
+        "robot": robot, "goal": np.ones((21, 2, 2), np.float32),
+        "box": np.full((21, 2, 3), np.nan, np.float32), "obstacles": np.zeros((2, 1, 2)),
+        "reward": np.ones((20, 2), np.float32), "cost_indicator": np.zeros((20, 2)),
+        "goal_met": np.zeros((20, 2)), "obstacle_size": np.array(0.15), "d_min": np.array(D_MIN),
+        "goal_size": np.array(0.3), "extent": np.array(2.0), "solid_obstacles": np.array(True),
+    }  # fmt: skip
+
+
+def draw_nothing(ax, scene, trajectory=None):
+    ax.plot(*scene.robot[:2], "k.")
+    return ax
+
+
+def test_trajectories_state_the_return_and_draw_the_path(tmp_path):
+    path = tmp_path / "rollouts.npz"
+    data.save(path, recording(0.0))
+    recorded = {"SafeMR": data.load(path), "JointSIS": recording(0.5)}
+    figure = scenes.trajectories(recorded, draw_nothing, steps=10)
+    assert len(figure.axes) == 4
+    assert figure.axes[0].get_title() == "return 10.0"
+    tracks = [line for line in figure.axes[2].lines if line.get_color() == style.colour("JointSIS")]
+    np.testing.assert_allclose(tracks[0].get_xdata(), 0.5 + np.linspace(0, 0.5, 11), atol=1e-6)
+
+
+def test_animation_is_a_small_looping_gif(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "a.gif"
+    scenes.animation({"SafeMR": recording(0)}, draw_nothing, path, steps=20, stride=4, pixels=120)
+    with Image.open(path) as image:
+        assert image.n_frames == 6
+        assert image.info["loop"] == 0
+        assert image.info["duration"] == 80
+
+
+def test_rollout_data_from_elsewhere_is_refused(tmp_path):
+    path = tmp_path / "bad.npz"
+    path.write_bytes(b"nothing")
+    with pytest.raises(UserError, match=r"bad\.npz"):
+        data.load(path)

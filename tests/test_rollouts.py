@@ -1,0 +1,79 @@
+"""Rollout data: the episodes of the evaluation, and multiplier maps of a moving robot."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from safemr import rollouts
+from safemr.energy import energy, largest
+from safemr.errors import UserError
+from safemr.evaluate import evaluate
+from safemr.falsification import make_simulator
+from safemr.networks import StackedMLP
+from safemr.observation import ObservationTransform
+from safemr.plotting import data
+from safemr.policies import Policy, network_arrays
+from safemr.reference import PHI_H
+
+TASK = "Pillars-0.15-Goal"
+LAYOUT = {"max_episode_steps": 60}
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    envs = make_simulator(TASK, 1)
+    transform = ObservationTransform.for_layout(envs.observation_layout)
+    envs.close()
+    generator = torch.Generator().manual_seed(0)
+    actor = StackedMLP(1, (transform.dim, 8, 4), "elu", generator=generator)
+    multiplier = StackedMLP(1, (transform.dim, 8, 1), "elu", generator=generator)
+    extras = {**network_arrays("multiplier", multiplier), "multiplier_cap": np.array(0.7)}
+    return Policy(transform, actor, squash=True, extras=extras)
+
+
+def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
+    recorded = rollouts.episodes(policy, TASK, seeds=[5, 6, 7], steps=60, settings=LAYOUT)
+    envs = make_simulator(TASK, 3, LAYOUT)
+    scores = evaluate(policy, envs, seed=5)
+    envs.close()
+    assert recorded["reward"].sum(0).mean() == pytest.approx(scores["return"], abs=1e-5)
+    assert recorded["robot"].shape == (61, 3, 3)
+    data.save(tmp_path / "a.npz", recorded)
+    loaded = data.load(tmp_path / "a.npz")
+    scene = data.scene_at(loaded, episode=1, step=60)
+    np.testing.assert_array_equal(scene.robot, recorded["robot"][60, 1])
+    assert scene.box is None
+    assert scene.task.d_min == pytest.approx(0.25)
+
+
+def test_no_more_steps_than_an_episode_has(policy):
+    with pytest.raises(UserError, match="60 steps, 61 were asked"):
+        rollouts.episodes(policy, TASK, seeds=[0], steps=61, settings=LAYOUT)
+
+
+def test_multiplier_map_is_the_energy_of_a_moving_robot_around_the_obstacles(policy):
+    speed, heading = 0.5, 0.7
+    plane = rollouts.multiplier_map(
+        policy, PHI_H, TASK, seed=2, points=21, speed=speed, heading=heading
+    )
+    x, y = np.meshgrid(plane["x"], plane["y"])
+    gaps = np.stack([x, y], -1)[..., None, :] - plane["obstacles"]
+    d = np.linalg.norm(gaps, axis=-1)
+    d_dot = (gaps @ [np.cos(heading), np.sin(heading)]) / d * speed
+    expected = largest(energy(d, d_dot, 0.25, *PHI_H))
+    free = ~np.isnan(plane["multiplier"])
+    assert 0.9 < free.mean() < 1
+    # the robot has coasted for one step, in which drag takes 4% of its speed
+    np.testing.assert_allclose(plane["phi"][free], expected[free], atol=0.03)
+    assert (d.min(-1)[free] >= 0.25).all()
+    inside = plane["multiplier"][free]
+    assert (inside > 0).all()
+    assert inside.max() <= 0.7 + 1e-6
+
+
+def test_a_policy_without_multiplier_is_refused(policy):
+    bare = Policy(policy.transform, policy.network, squash=True)
+    with pytest.raises(UserError, match="without a multiplier"):
+        rollouts.multipliers(bare, np.zeros((1, 44)))

@@ -1,0 +1,319 @@
+"""Tables and claims: numbers on a small fixed record set, missing runs, and the rules' verdicts."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from safemr import claims, reference, statistics, tables
+from safemr.evidence import Evidence
+
+TASK, OTHER = "Pillars-0.15-Goal", "Hazards-0.15-Push"
+RETURNS = {
+    (TASK, "SafeMR"): [19.5, 19.6, 18.8],
+    (TASK, "JointSIS"): [17.3, 15.9, 16.8],
+    (TASK, "FAC-phih"): [15.8, 16.0, 15.1],
+    (TASK, "FAC-phi0"): [24.0, 23.5, 24.4],
+    (TASK, "CPO"): [21.0, 22.0, 20.5],
+    (OTHER, "SafeMR"): [1.7, 1.8, 1.6],
+    (OTHER, "JointSIS"): [1.75, 1.7, 1.68],
+}
+UNSAFE_STEPS = {"FAC-phi0": [3.0, 3.2, 2.9], "CPO": [30.0, 25.0, 40.0]}
+
+
+def score_rows() -> pd.DataFrame:
+    rows = []
+    for (task, variant), returns in RETURNS.items():
+        steps = UNSAFE_STEPS.get(variant, [0.0, 0.0, 0.0])
+        for seed, (value, cost) in enumerate(zip(returns, steps, strict=True)):
+            for metric, score in (
+                ("eval_return", value),
+                ("eval_cost", cost),
+                ("eval_cost_indicator", cost),
+                ("eval_zero_violation_share", 1.0 if cost == 0 else 0.4),
+            ):
+                rows.append((task, variant, seed, metric, score))
+    return pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+
+
+@pytest.fixture
+def scores() -> pd.DataFrame:
+    return score_rows()
+
+
+def expected_runs(seeds: int = 3) -> pd.DataFrame:
+    rows = [(task, variant, seed) for task, variant in RETURNS for seed in range(seeds)]
+    return pd.DataFrame(rows, columns=["task", "variant", "seed"])
+
+
+def cells(table: tables.Table) -> list[list[str]]:
+    lines = [line for line in table.markdown().splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+# --- tables --------------------------------------------------------------------------------------
+
+
+def test_table_one_names_the_best_safe_baseline_and_the_papers_arithmetic(scores):
+    table = tables.table_one(scores, tasks=[TASK, OTHER])
+    row = table.data.set_index("task").loc[TASK]
+    assert row["baseline"] == "JointSIS"  # FAC-phi0 and CPO return more, but are not safe
+    assert row["safemr"] == pytest.approx(np.mean(RETURNS[TASK, "SafeMR"]))
+    assert row["improvement"] == pytest.approx(57.9 / 50.0 - 1)
+    assert row["improvement_low"] < row["improvement"] < row["improvement_high"]
+    assert row["paper_printed"] == 10.2
+    assert row["paper_recomputed"] == pytest.approx(100 * (10.034 - 9.286) / 9.286)
+    half = stats.t.ppf(0.975, 2) * np.std(RETURNS[TASK, "SafeMR"], ddof=1) / np.sqrt(3)
+    assert cells(table)[2][1] == f"{57.9 / 3:.2f} ± {half:.2f}"
+    assert "(JointSIS)" in cells(table)[3][1]
+    assert "at most 1 violating step" in table.caption
+
+
+def test_only_the_first_printed_improvement_of_the_paper_is_wrong():
+    wrong = [t for t, r in reference.TABLE_I.items()
+             if abs(r.printed_improvement - r.improvement) > 0.06]  # fmt: skip
+    assert wrong == ["Pillars-0.15-Goal"]
+
+
+@pytest.mark.parametrize("ending", ["csv", "md", "tex"])
+def test_written_forms_hold_the_same_numbers(scores, tmp_path, ending):
+    paths = {path.suffix[1:]: path for path in tables.full_results(scores).write(tmp_path)}
+    text = paths[ending].read_text(encoding="utf-8")
+    iqm = statistics.interquartile_mean(np.array(RETURNS[TASK, "SafeMR"]))
+    if ending == "csv":
+        data = pd.read_csv(paths["csv"]).set_index(["task", "variant", "metric"])
+        assert data.loc[(TASK, "SafeMR", "eval_return"), "iqm"] == pytest.approx(iqm, rel=1e-15)
+    else:
+        assert f"[{iqm:.2f}]" in text
+        assert ("$\\pm$" in text) == (ending == "tex")
+
+
+def test_full_results_say_who_is_safe_and_order_the_algorithms(scores):
+    rows = cells(tables.full_results(scores))[2:]
+    verdicts = {(row[0], row[1]): row[3] for row in rows}
+    assert verdicts[TASK, "SafeMR"] == "yes"
+    assert verdicts[TASK, "CPO"] == "no"
+    first = [row[1] for row in rows if row[0] == TASK]
+    assert first == ["SafeMR", "JointSIS", "CPO", "FAC-phi0", "FAC-phih"]
+
+
+def test_missing_runs_get_a_row_and_a_note_instead_of_a_gap(scores):
+    expected = pd.concat(
+        [expected_runs(4), pd.DataFrame([(OTHER, "PPO-L", 0)], columns=["task", "variant", "seed"])]
+    )
+    missing = statistics.missing_runs(expected, scores)
+    table = tables.full_results(scores, missing=missing)
+    row = next(row for row in cells(table) if row[:2] == [OTHER, "PPO-L"])
+    assert row[2] == tables.MISSING
+    assert row[4] == tables.MISSING
+    assert "SafeMR on Pillars-0.15-Goal (seed 3)" in table.notes[0]
+    assert "PPO-L on Hazards-0.15-Push (seed 0)" in table.notes[0]
+    assert "Runs missing" in table.latex()
+
+
+def test_no_run_at_all_still_makes_every_table(scores):
+    nothing = scores.iloc[:0]
+    missing = expected_runs()
+    for table in (
+        tables.table_one(nothing, missing=missing),
+        tables.full_results(nothing, missing=missing),
+        tables.push_split(nothing, missing=missing),
+        tables.table_two(nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
+    ):
+        assert "Runs missing" in table.markdown()
+
+
+def test_table_two_stands_beside_the_papers_parameters():
+    final = pd.DataFrame(
+        [(TASK, "SafeMR", seed, name, value + 0.01 * seed)
+         for seed in (0, 1) for name, value in (("sigma", 0.2), ("k", 0.9), ("n", 2.0))],
+        columns=["task", "variant", "seed", "metric", "value"],
+    )  # fmt: skip
+    table = tables.table_two(final, {"SafeMR": (0.35, 0.15)})
+    rows = {row[1]: row[2:] for row in cells(table)[2:]}
+    assert rows["mean"] == ["0.205", "0.905", "2.005"]
+    assert rows["paper"] == ["0.201", "0.835", "2.084"]
+    assert rows["1"][0] == "0.210"
+
+
+def test_push_returns_are_split_into_their_parts():
+    rows = [(OTHER, name, seed, metric, value)
+            for name, parts in (("SafeMR", (1.5, 0.2)), ("scripted: pushes the box", (1.5, 2.4)))
+            for seed in (0, 1)
+            for metric, value in zip(("eval_reward_approach", "eval_reward_push"), parts,
+                                     strict=True)]  # fmt: skip
+    split = tables.push_split(
+        pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+    )
+    found = {row[1]: row[5:7] for row in cells(split)[2:]}
+    assert found["SafeMR"] == ["1.50 ± 0.00", "0.20 ± 0.00"]
+    assert found["scripted: pushes the box"][1] == "2.40 ± 0.00"
+
+
+def test_safe_returns_count_unsafe_runs_as_zero(scores):
+    gated = tables.SafetyRule().safe_returns(scores)
+    assert statistics.scores_of(gated, TASK, "CPO", "eval_return").tolist() == [0, 0, 0]
+    kept = statistics.scores_of(gated, TASK, "SafeMR", "eval_return").tolist()
+    assert kept == RETURNS[TASK, "SafeMR"]
+
+
+def test_latex_escapes_what_latex_would_read_as_commands():
+    frame = pd.DataFrame({"a_b": ["50% & $x"]})
+    text = tables.Table("t", "caption #1", frame, frame).latex()
+    assert r"a\_b" in text
+    assert r"50\% \& \$x" in text
+    assert r"caption \#1" in text
+
+
+# --- claims --------------------------------------------------------------------------------------
+
+
+def evidence(scores: pd.DataFrame, **changes: object) -> Evidence:
+    empty = pd.DataFrame(columns=["task", "variant", "seed", "step", "metric", "value"])
+    base = Evidence(scores, empty, tasks=(TASK,))
+    return replace(base, **changes)  # type: ignore[arg-type]
+
+
+def verdict(name: str, given: Evidence) -> str:
+    (claim,) = [claim for claim in claims.claims(given.tasks) if claim.name == name]
+    return claim.judge(given).verdict
+
+
+def with_baselines(scores: pd.DataFrame) -> pd.DataFrame:
+    """The other CMDP baselines get CPO's runs."""
+    cpo = scores[scores["variant"] == "CPO"]
+    return pd.concat([scores, *(cpo.assign(variant=name) for name in ("PPO-L", "TRPO-L"))])
+
+
+@pytest.mark.parametrize(
+    ("shift", "expected"), [(0.0, "confirmed"), (-2.3, "inconclusive"), (-9.0, "refuted")]
+)
+def test_highest_return_follows_the_interval_of_the_difference(scores, shift, expected):
+    scores = with_baselines(scores)
+    ours = (scores["variant"] == "SafeMR") & (scores["metric"] == "eval_return")
+    scores.loc[ours, "value"] += shift
+    assert verdict(f"highest_return[{TASK}]", evidence(scores)) == expected
+
+
+def test_an_unsafe_method_cannot_have_the_highest_safe_return(scores):
+    scores = with_baselines(scores)
+    ours = (scores["variant"] == "SafeMR") & (scores["metric"] == "eval_cost_indicator")
+    scores.loc[ours, "value"] = 5.0
+    assert verdict(f"highest_return[{TASK}]", evidence(scores)) == "refuted"
+
+
+@pytest.mark.parametrize(
+    ("shares", "expected"),
+    [([1.0, 1.0, 1.0], "confirmed"), ([1.0, 1.0, 0.98], "inconclusive"),
+     ([0.9, 0.93, 0.96], "refuted"), ([0.98, 0.981, 0.979], "refuted")],
+)  # fmt: skip
+def test_zero_violations(scores, shares, expected):
+    ours = (scores["variant"] == "SafeMR") & (scores["metric"] == "eval_zero_violation_share")
+    scores.loc[ours & (scores["task"] == TASK), "value"] = shares
+    assert verdict("zero_violations", evidence(scores)) == expected
+
+
+def test_unsafe_baselines_and_safe_ones(scores):
+    given = evidence(with_baselines(scores))
+    assert verdict("unsafe[CPO]", given) == "confirmed"
+    assert verdict("safe_but_lower[JointSIS]", given) == "confirmed"
+    assert verdict("safe_but_lower[FAC-phih]", given) == "confirmed"
+    safe = scores.replace({"variant": {"FAC-phih": "CPO", "CPO": "FAC-phih"}})
+    assert verdict("unsafe[CPO]", evidence(safe)) == "refuted"
+    assert verdict("safe_but_lower[FAC-phih]", evidence(safe)) == "refuted"
+
+
+def test_one_missing_seed_makes_a_claim_inconclusive_and_is_named(scores):
+    given = evidence(scores, expected=expected_runs(4))
+    (claim,) = [claim for claim in claims.claims((TASK,)) if claim.name == "unsafe[CPO]"]
+    finding = claim.judge(given)
+    assert finding.verdict == "inconclusive"
+    assert finding.reason == "runs missing: CPO on Pillars-0.15-Goal (seed 3)"
+
+
+def test_points_must_all_beat_joint_sis(scores):
+    labels = {"SafeMR": (0.35, 0.15), "SafeMR[0.45,0.15]": (0.45, 0.15),
+              "SafeMR[0.35,0.25]": (0.35, 0.25)}  # fmt: skip
+    ours = scores[(scores["variant"] == "SafeMR") & (scores["task"] == TASK)]
+    good = pd.concat([scores, *(ours.assign(variant=name) for name in list(labels)[1:])])
+    assert verdict("sensitivity_return", evidence(good, points=labels)) == "confirmed"
+    assert verdict("sensitivity_cost", evidence(good, points=labels)) == "confirmed"
+    worse = (good["variant"] == "SafeMR[0.35,0.25]") & (good["metric"] == "eval_return")
+    good.loc[worse, "value"] -= 8
+    assert verdict("sensitivity_return", evidence(good, points=labels)) == "refuted"
+    assert verdict("sensitivity_return", evidence(scores)) == "inconclusive"
+
+
+@pytest.mark.parametrize(
+    ("volumes", "missed", "expected"),
+    [((1.7, 1.9), 0.005, ("confirmed", "confirmed")), ((1.9, 1.7), 0.05, ("refuted", "refuted"))],
+)
+def test_aircraft_claims(scores, volumes, missed, expected):
+    rows = []
+    for seed, noise in enumerate((-0.01, 0.0, 0.01)):
+        for variant, volume in zip(("SafeMR", "JointSIS"), volumes, strict=True):
+            rows.append((variant, seed, volume + noise, missed * (1 + 0.1 * noise)))
+    rows.append(("phi_h", np.nan, 0.78, 0.76))
+    table = pd.DataFrame(rows, columns=["variant", "seed", "volume_ratio", "missed_share"])
+    given = evidence(scores, aircraft=table)
+    assert (verdict("conservativeness", given), verdict("coverage", given)) == expected
+    assert verdict("handcrafted_coverage", given) == "confirmed"
+
+
+@pytest.mark.parametrize(
+    ("worst", "aligned", "expected"),
+    [(0.02, 1.0, "refuted"), (-0.01, 1.0, "confirmed"), (-0.01, -1.0, "inconclusive")],
+)
+def test_one_state_without_a_safe_action_refutes_feasibility(scores, worst, aligned, expected):
+    row = {"certificate": "paper [0.35, 0.15]", "worst_margin": worst, "infeasible_share": 0.0,
+           "margin_inside_aligned": aligned, "margin_outside_aligned": aligned,
+           "margin_inside_drag": -1.0, "margin_outside_drag": -1.0}  # fmt: skip
+    given = evidence(scores, certificates=pd.DataFrame([row]))
+    assert verdict("feasibility_paper", given) == expected
+    assert verdict("feasibility_ours", given) == "inconclusive"
+
+
+def curve_rows(curves: dict[str, np.ndarray]) -> pd.DataFrame:
+    rows = [
+        (TASK, "SafeMR", seed, 100 * (index + 1), metric, float(value) + 1e-4 * seed * index)
+        for seed in range(3)
+        for metric, values in curves.items()
+        for index, value in enumerate(values)
+    ]
+    return pd.DataFrame(rows, columns=["task", "variant", "seed", "step", "metric", "value"])
+
+
+@pytest.mark.parametrize(("slow", "expected"), [(0.5, "confirmed"), (0.02, "refuted")])
+def test_slowest_certificate_compares_settling_times(scores, slow, expected):
+    time = np.linspace(0, 1, 60)
+    curves = {name: np.exp(-time / slow) for name in ("sigma", "k", "n")}
+    curves |= {"train_return": -np.exp(-time / 0.1), "multiplier_mean": -np.exp(-time / 0.15)}
+    given = evidence(scores, progress=curve_rows(curves))
+    assert verdict("slowest_certificate", given) == expected
+
+
+@pytest.mark.parametrize(("growth", "expected"), [(0.0, "confirmed"), (9.0, "refuted")])
+def test_bounded_losses(scores, growth, expected):
+    time = np.linspace(0, 1, 60)
+    curves = {"critic_loss": np.exp(growth * time), "policy_grad_norm": np.ones(60)}
+    assert verdict("bounded", evidence(scores, progress=curve_rows(curves))) == expected
+
+
+def test_a_claims_table_without_any_run_is_complete_and_inconclusive():
+    nothing = evidence(score_rows().iloc[:0], tasks=reference.TASKS)
+    table = claims.claims_table(nothing)
+    assert set(table.data["verdict"]) == {"inconclusive"}
+    assert table.data["reason"].str.startswith("runs missing: ").all()
+
+
+def test_every_claim_has_its_rule_in_the_documentation():
+    text = (Path(__file__).parents[1] / "docs" / "claims.md").read_text(encoding="utf-8")
+    documented = re.findall(r"^\| `([a-z_]+)", text, flags=re.MULTILINE)
+    judged = list(dict.fromkeys(claim.name.split("[")[0] for claim in claims.claims()))
+    assert documented == judged
