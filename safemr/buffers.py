@@ -131,16 +131,19 @@ class Replay:
 
     def _follow_compiled(self, flat: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """`_follow` on a CPU, in a tenth of its time."""
-        names = ("rewards", "ended", "terminated")
-        rows, last, returns, discounts = _follow(
+        fields = {name: table.numpy() for name, table in self._fields.items()}
+        found = _follow(
             flat.numpy(),
             (self._head - self.size) % self.capacity * self.num_envs,
             self.num_envs,
             self.size,
-            *(self._fields[name].numpy() for name in names),
+            fields["rewards"],
+            fields["ended"],
+            fields["terminated"],
             self._discount.numpy(),
         )
-        return tuple(map(torch.from_numpy, (rows, last, returns, discounts)))  # type: ignore[return-value]
+        rows, last, returns, discounts = map(torch.from_numpy, found)
+        return rows, last, returns, discounts
 
     def state_dict(self) -> dict[str, Any]:
         rows = self.size * self.num_envs

@@ -1,4 +1,4 @@
-"""The ``fused`` backend of the soft actor-critic family: `fac.Steps` by compiled kernels.
+"""The ``fused`` backend of the soft actor-critic family: its steps by compiled kernels.
 
 It owns no state. Networks, moments and step counts are the agent's own torch tensors, of which the
 kernels see the memory, so saving, resuming and target networks are those of the other backend.
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from safemr import kernels
 from safemr.algorithms import fac
+from safemr.autograd import AutogradSteps
 from safemr.buffers import Batch
 from safemr.networks import ACTIVATIONS, StackedMLP
 
@@ -39,8 +40,8 @@ def optimiser(adam: torch.optim.Adam) -> kernels.Optimiser:
     return kernels.Optimiser(*(state[name].detach().view(-1).numpy() for name in names))
 
 
-class FusedSteps(fac.Steps):
-    """`fac.Steps` without autograd: the same numbers up to the order of summation.
+class FusedSteps(AutogradSteps):
+    """`AutogradSteps` without autograd: the same numbers up to the order of summation.
 
     Bound to the agent's tensors at the first step; an agent that exchanges them makes a new one.
     """

@@ -13,20 +13,19 @@ and every elementwise loop runs along memory.
 
 from __future__ import annotations
 
+import ctypes
 import math
-import os
-from typing import NamedTuple
-
-# Read when the library behind np.dot is loaded: these products are too small to share.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cython_blas
 
 from safemr.networks import ACTIVATIONS, LOG_STD_MAX, LOG_STD_MIN
 
 Floats = NDArray[np.float32]
+Scalar = Any  # float32 when compiled
 
 # Sums may be reordered, so that they vectorise; NaN and infinity keep their meaning, because
 # diverged training is recognised by them.
@@ -43,13 +42,28 @@ _LINEAR_FROM = np.float32(20.0)  # beyond this softplus(x) = x in float32
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, np.float32(1e-8)  # defaults of torch.optim.Adam
 
 
+def _use_one_blas_thread() -> None:
+    """np.dot in compiled code calls scipy's BLAS, whose threads only wait at these sizes.
+
+    Environment variables would be read when scipy is first imported, which may have happened.
+    """
+    library = ctypes.CDLL(cython_blas.__file__)  # names are looked up in what it links, too
+    openblas = "openblas_set_num_threads"
+    for name in (openblas, f"scipy_{openblas}", "MKL_Set_Num_Threads"):
+        if hasattr(library, name):
+            getattr(library, name)(1)
+
+
+_use_one_blas_thread()
+
+
 class Network(NamedTuple):
     """A `safemr.networks.StackedMLP`: its flat parameters, layer widths, number of members and
     index of its activation in ACTIVATIONS."""
 
     parameters: Floats
     sizes: NDArray[np.int64]
-    count: int
+    members: int
     activation: int
 
 
@@ -66,11 +80,11 @@ def _layer(flat: Floats, net: Network, level: int) -> tuple[Floats, Floats]:
     """Views of a layer: weight [K, out, in] and bias [K, out]; `networks.Shape.layers`."""
     at = 0
     for below in range(level):
-        at += net.count * (net.sizes[below] + 1) * net.sizes[below + 1]
+        at += net.members * (net.sizes[below] + 1) * net.sizes[below + 1]
     i, o = net.sizes[level], net.sizes[level + 1]
-    middle = at + net.count * o * i
-    weight = flat[at:middle].reshape((net.count, o, i))
-    return weight, flat[middle : middle + net.count * o].reshape((net.count, o))
+    middle = at + net.members * o * i
+    weight = flat[at:middle].reshape((net.members, o, i))
+    return weight, flat[middle : middle + net.members * o].reshape((net.members, o))
 
 
 @_compiled
@@ -78,9 +92,9 @@ def _hidden(net: Network, memory: Floats, level: int, batch: int) -> Floats:
     """View [K, width, B] of the activations that enter ``level`` >= 1."""
     at = 0
     for below in range(1, level):
-        at += net.count * net.sizes[below] * batch
-    size = net.count * net.sizes[level] * batch
-    return memory[at : at + size].reshape((net.count, net.sizes[level], batch))
+        at += net.members * net.sizes[below] * batch
+    size = net.members * net.sizes[level] * batch
+    return memory[at : at + size].reshape((net.members, net.sizes[level], batch))
 
 
 @_compiled
@@ -89,7 +103,7 @@ def _memory(net: Network, batch: int) -> Floats:
     width = 0
     for level in range(1, len(net.sizes) - 1):
         width += net.sizes[level]
-    return np.empty(net.count * width * batch, np.float32)
+    return np.empty(net.members * width * batch, np.float32)
 
 
 @_compiled
@@ -139,18 +153,18 @@ def _activation_gradient(grad: Floats, output: Floats, activation: int) -> None:
 def forward(net: Network, x: Floats, memory: Floats) -> Floats:
     """Outputs [K, out, B] of all members at x [B, in]; hidden activations stay in ``memory``."""
     batch, levels = len(x), len(net.sizes) - 1
-    out = np.empty((net.count, net.sizes[-1], batch), np.float32)
+    out = np.empty((net.members, net.sizes[-1], batch), np.float32)
     for level in range(levels):
         weight, bias = _layer(net.parameters, net, level)
         z = out if level == levels - 1 else _hidden(net, memory, level + 1, batch)
         if weight.shape[2] == 0:  # a perceptron without inputs is its bias
             z.fill(_0)
         elif level == 0:
-            rows = net.count * weight.shape[1]
+            rows = net.members * weight.shape[1]
             np.dot(weight.reshape((rows, weight.shape[2])), x.T, z.reshape((rows, batch)))
         else:
             below = _hidden(net, memory, level, batch)
-            for member in range(net.count):
+            for member in range(net.members):
                 np.dot(weight[member], below[member], z[member])
         if level == levels - 1:
             _add_bias(z, bias)
@@ -165,7 +179,7 @@ def _backward_hidden(net: Network, level: int, grad: Floats, memory: Floats) -> 
     weight, _ = _layer(net.parameters, net, level)
     output = _hidden(net, memory, level, grad.shape[2])
     below = np.empty_like(output)
-    for member in range(net.count):
+    for member in range(net.members):
         np.dot(weight[member].T, grad[member], below[member])
     _activation_gradient(below, output, net.activation)
     return below
@@ -177,16 +191,16 @@ def backward(net: Network, x: Floats, memory: Floats, grad: Floats) -> Floats:
     flat, batch = np.empty_like(net.parameters), len(x)
     for level in range(len(net.sizes) - 2, -1, -1):
         weight, bias = _layer(flat, net, level)
-        for member in range(net.count):
+        for member in range(net.members):
             for row in range(weight.shape[1]):
                 bias[member, row] = grad[member, row].sum()
         if level == 0:
-            rows = net.count * weight.shape[1]
+            rows = net.members * weight.shape[1]
             if weight.size:
                 np.dot(grad.reshape((rows, batch)), x, weight.reshape((rows, weight.shape[2])))
         else:
             below = _hidden(net, memory, level, batch)
-            for member in range(net.count):
+            for member in range(net.members):
                 np.dot(grad[member], below[member].T, weight[member])
             grad = _backward_hidden(net, level, grad, memory)
     return flat
@@ -198,7 +212,7 @@ def backward_inputs(net: Network, memory: Floats, grad: Floats, first: int) -> F
     for level in range(len(net.sizes) - 2, 0, -1):
         grad = _backward_hidden(net, level, grad, memory)
     weight, _ = _layer(net.parameters, net, 0)
-    rows = net.count * weight.shape[1]
+    rows = net.members * weight.shape[1]
     table = weight.reshape((rows, weight.shape[2]))
     columns = np.empty((weight.shape[2] - first, rows), np.float32)
     for column in range(len(columns)):
@@ -224,7 +238,7 @@ def adam(parameters: Floats, grad: Floats, optimiser: Optimiser, lr: float) -> N
 
 
 @_compiled
-def _approach(old: Floats, new: Floats, rate: float) -> None:
+def _approach(old: Floats, new: Floats, rate: Scalar) -> None:
     for j in range(len(old)):
         old[j] += rate * (new[j] - old[j])
 
@@ -240,7 +254,7 @@ def polyak(target: Network, source: Network, rate: float) -> None:
 
 
 @_compiled
-def _norm(grad: Floats) -> float:
+def _norm(grad: Floats) -> Scalar:
     total = _0
     for j in range(len(grad)):
         total += grad[j] * grad[j]
@@ -248,12 +262,12 @@ def _norm(grad: Floats) -> float:
 
 
 @_compiled
-def _softplus(x: float) -> float:
+def _softplus(x: Scalar) -> Scalar:
     return x if x > _LINEAR_FROM else math.log1p(math.exp(x))
 
 
 @_compiled
-def _sigmoid(x: float) -> float:
+def _sigmoid(x: Scalar) -> Scalar:
     return _1 / (_1 + math.exp(-x))
 
 
@@ -301,7 +315,7 @@ def next_values(
     actions, log_densities = sample(policy, observations, noise)
     inputs = _joined(observations, actions)
     values = forward(targets, inputs, _memory(targets, len(inputs)))
-    return values.reshape((targets.count, len(inputs))), log_densities
+    return values.reshape((targets.members, len(inputs))), log_densities
 
 
 @_compiled
@@ -312,14 +326,14 @@ def critic_step(
     observations: Floats,
     actions: Floats,
     targets: Floats,
-) -> tuple[float, float, float]:
+) -> tuple[Scalar, Scalar, Scalar]:
     """A step on `fac.critic_loss`; targets [K, B]. Returns loss, gradient norm, mean of Q_1."""
     inputs = _joined(observations, actions)
     memory = _memory(critics, len(inputs))
     values = forward(critics, inputs, memory)
     mean = values[0].mean()
     scale, loss = _2 / np.float32(len(inputs)), _0
-    for member in range(critics.count):
+    for member in range(critics.members):
         for b in range(len(inputs)):
             error = values[member, 0, b] - targets[member, b]
             loss += error * error
@@ -330,7 +344,7 @@ def critic_step(
 
 
 @_compiled
-def _multipliers(raw: Floats, cap: float) -> Floats:
+def _multipliers(raw: Floats, cap: Scalar) -> Floats:
     """lambda = min(softplus(raw), cap), [B]."""
     out = np.empty_like(raw)
     for b in range(len(raw)):
@@ -355,7 +369,7 @@ def policy_step(
     constraint_scale: float,
     cap: float,
     target_entropy: float,
-) -> tuple[Floats, Floats, Floats, Floats, float, float, float]:
+) -> tuple[Floats, Floats, Floats, Floats, Scalar, Scalar, Scalar]:
     """Steps on `fac.policy_loss` and `fac.temperature_loss`; the last critic is the constraint's.
 
     Returns lambda(s), Q_phi(s, a) [B], the multiplier network's raw outputs [B] and hidden
@@ -378,12 +392,12 @@ def policy_step(
     for b in range(batch):
         constraint[b] = values[-1, 0, b] / scale
         least, ties = values[0, 0, b], 0
-        for member in range(critics.count - 1):
+        for member in range(critics.members - 1):
             least = min(least, values[member, 0, b])
-        for member in range(critics.count - 1):
+        for member in range(critics.members - 1):
             ties += values[member, 0, b] == least
         loss += temperature * log_densities[b] - least + multipliers[b] * constraint[b]
-        for member in range(critics.count - 1):
+        for member in range(critics.members - 1):
             values[member, 0, b] = -share / ties if values[member, 0, b] == least else _0
         values[-1, 0, b] = share * multipliers[b] / scale
 

@@ -22,7 +22,7 @@ class Mirror(contextlib.AbstractContextManager["Mirror"]):
         self, config: Mapping[str, Any], session: RunSession, settings: Mapping[str, str]
     ) -> None:
         self._config, self._session = config, session
-        self._mode = settings.get("mode", "disabled")
+        self._mode: Any = settings.get("mode", "disabled")
         self._project = settings.get("project", "safemr")
         self._run: Any = None
 

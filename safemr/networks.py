@@ -162,11 +162,11 @@ class StackedMLP:
         self._layers = self.shape.layers(parameters.detach())
 
     def __call__(self, x: Tensor) -> Tensor:
-        return _Forward.apply(x, self.parameters, self.shape, self._layers)  # type: ignore[no-any-return]
+        return _Forward.apply(x, self.parameters, self.shape, self._layers)
 
     def frozen(self, x: Tensor) -> Tensor:
         """The same outputs, differentiable in x only."""
-        return _Forward.apply(x, self.parameters.detach(), self.shape, self._layers)  # type: ignore[no-any-return]
+        return _Forward.apply(x, self.parameters.detach(), self.shape, self._layers)
 
     @torch.no_grad()
     def jvp(self, x: Tensor, tangent: Tensor) -> Tensor:

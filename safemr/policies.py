@@ -72,10 +72,7 @@ class Policy:
         parameters = self.network.parameters
         inputs = torch.from_numpy(self.transform(observations)).to(parameters.device)
         output = self.network(inputs)[0]
-        if self.squash:
-            mean, log_std = output.chunk(2, -1)
-        else:
-            mean, log_std = output, self.log_std
+        mean, log_std = output.chunk(2, -1) if self.squash else (output, self.log_std)
         if not deterministic:
             if log_std is None:
                 raise ValueError("this policy has no standard deviation to sample with")

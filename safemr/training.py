@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol
 
-import gymnasium as gym
 import numpy as np
 import torch
 
 from safemr.policies import Policy
 
-MakeEnvs = Callable[[int], gym.vector.VectorEnv]
+# Number of sub-environments -> a batched environment with the attributes of this repository's tasks
+# (d_min, num_obstacles, observation_layout, get_state, ...), which Gymnasium's type does not have.
+MakeEnvs = Callable[[int], Any]
 
 
 class TrainingDivergedError(RuntimeError):

@@ -12,6 +12,7 @@ import torch
 
 from safemr import fused, kernels
 from safemr.algorithms import fac, joint_sis, sac_lagrangian, safemr
+from safemr.autograd import AutogradSteps
 from safemr.buffers import Batch, Replay
 from safemr.networks import ACTIVATIONS, StackedMLP
 
@@ -134,9 +135,9 @@ def test_choice_of_the_backend() -> None:
     """A device other than the CPU has no compiled kernels."""
     agent = make(fac, "fused")
     assert type(agent.steps) is fused.FusedSteps
-    assert type(make(fac, "torch").steps) is fac.Steps
+    assert type(make(fac, "torch").steps) is AutogradSteps
     agent.config = dataclasses.replace(agent.config, device="cuda")
-    assert type(agent._make_steps()) is fac.Steps
+    assert type(agent._make_steps()) is AutogradSteps
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

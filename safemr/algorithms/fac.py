@@ -15,6 +15,8 @@ SafeMR extend this file by their certificate loss.
 | temperature (Haarnoja et al. 2018) | `temperature_loss` |
 | delays m_pi < m_lambda < m_phi (Alg. 1) | `Agent.update` |
 
+The gradients of these losses are taken by `safemr.autograd` or, equal but faster, `safemr.fused`.
+
 Deviations from the paper and from the authors' released code, each a field of `Config`:
 minimum of two critics (usual practice; Eq. losspi has one), n-step returns, the multiplier is
 trained on the current policy's action instead of the replayed one, larger learning rates and
@@ -25,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -34,9 +36,12 @@ from torch import Tensor
 from safemr import energy, off_policy
 from safemr.buffers import Batch
 from safemr.errors import UserError
-from safemr.networks import ACTIVATIONS, Activation, StackedMLP, squashed_gaussian
+from safemr.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.policies import network_arrays
 from safemr.training import generator
+
+if TYPE_CHECKING:
+    from safemr.autograd import AutogradSteps
 
 VERSION = 1
 
@@ -187,101 +192,8 @@ def temperature_loss(
     return -log_temperature * (log_densities.detach().mean() + target_entropy)
 
 
-class Steps:
-    """The gradient steps of an `Agent` by autograd on the losses above: their definition.
-
-    `safemr.fused.FusedSteps` overrides every public method with compiled kernels.
-    """
-
-    def __init__(self, agent: Agent) -> None:
-        self.agent = agent
-
-    @torch.no_grad()
-    def sample(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions [B, A] of the policy for standard normal noise, and log-densities [B]."""
-        return squashed_gaussian(self.agent.policy(observations)[0], noise)
-
-    @torch.no_grad()
-    def next_values(self, observations: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Target critics' values [K, B] of sampled actions, and log-densities [B] of these."""
-        action, log_density = self.sample(observations, noise)
-        return self.agent.targets(torch.cat((observations, action), 1))[..., 0], log_density
-
-    def follow_critics(self, rate: float) -> None:
-        """Polyak averaging of the target critics."""
-        self.agent.targets.follow(self.agent.critics, rate)
-
-    def update_critics(self, batch: Batch, target: Tensor, measure: bool) -> Info:
-        """A step on `critic_loss`; target [3, B]."""
-        critics = self.agent.critics
-        values = critics(torch.cat((batch.observations, batch.actions), 1))[..., 0]
-        loss = critic_loss(values, target)
-        gradient = self._step("critics", critics.parameters, loss)
-        if not measure:
-            return {}
-        return {
-            "critic_loss": loss.detach(),
-            "critic_grad_norm": gradient.norm(),
-            "value_mean": values[0].detach().mean(),
-        }
-
-    def update_policy(self, batch: Batch, with_multiplier: bool, measure: bool) -> Info:
-        """Steps on `policy_loss`, `temperature_loss` and, if asked for, `multiplier_loss`."""
-        agent, config, observations = self.agent, self.agent.config, batch.observations
-        output = agent.policy(observations)[0]
-        action, log_density = squashed_gaussian(output, agent.noise(len(output)))
-        values = agent.critics.frozen(torch.cat((observations, action), 1))[..., 0]
-        constraint = values[REWARD_CRITICS] / config.constraint_scale
-        with torch.set_grad_enabled(with_multiplier):
-            multipliers = agent.multipliers(observations)
-        loss = policy_loss(
-            log_density,
-            values[:REWARD_CRITICS],
-            constraint,
-            multipliers.detach(),
-            agent.log_temperature.detach().exp(),
-        )
-        gradient = self._step("policy", agent.policy.parameters, loss)
-        self._step(
-            "temperature",
-            agent.log_temperature,
-            temperature_loss(agent.log_temperature, log_density, config.target_entropy),
-        )
-        info: Info = {}
-        if measure:
-            info = {
-                "policy_loss": loss.detach(),
-                "policy_grad_norm": gradient.norm(),
-                "entropy": -log_density.detach().mean(),
-                "multiplier_mean": multipliers.detach().mean(),
-                "multiplier_max": multipliers.detach().amax(),
-                "constraint_mean": constraint.detach().mean(),
-            }
-        if with_multiplier:
-            if config.multiplier_action == "replay":
-                constraint = agent.constraint_of(observations, batch.actions)
-            dual = multiplier_loss(multipliers, constraint)
-            gradient = self._step(
-                "multiplier", agent.multiplier.parameters, dual, config.multiplier_grad_norm
-            )
-            if measure:
-                info["multiplier_grad_norm"] = gradient.norm()
-        return info
-
-    def _step(
-        self, name: str, parameters: Tensor, loss: Tensor, max_norm: float | None = None
-    ) -> Tensor:
-        """One optimiser step on ``loss``; returns the gradient."""
-        (gradient,) = torch.autograd.grad(loss, [parameters])
-        if max_norm is not None:
-            gradient.mul_((max_norm / (gradient.norm() + 1e-6)).clamp_max(1.0))
-        parameters.grad = gradient
-        self.agent.optimisers[name].step()
-        return gradient
-
-
 class Agent:
-    """Networks, optimisers and the order of Algorithm 1; `Steps` does the arithmetic.
+    """Networks, optimisers and the order of Algorithm 1; ``steps`` does the arithmetic.
 
     What a variant may override: `critic_targets` or `constraint_target`, `multiplier_inputs`,
     `update_certificate`, `metrics` and `extras`.
@@ -329,13 +241,15 @@ class Agent:
     def adam(parameters: Tensor, lr: float) -> torch.optim.Adam:
         return torch.optim.Adam([parameters], lr=lr, fused=True)
 
-    def _make_steps(self) -> Steps:
-        if self.config.backend == "torch" or self.config.device != "cpu":
-            return Steps(self)
-        # Imported here, because it needs this module, and the other backend no compiler.
-        from safemr.fused import FusedSteps
+    def _make_steps(self) -> AutogradSteps:
+        # Both differentiate the losses of this module, so they come after it.
+        if self.config.backend == "fused" and self.config.device == "cpu":
+            from safemr.fused import FusedSteps
 
-        return FusedSteps(self)
+            return FusedSteps(self)
+        from safemr.autograd import AutogradSteps
+
+        return AutogradSteps(self)
 
     def noise(self, count: int) -> Tensor:
         """Standard normal [count, A]."""
@@ -367,7 +281,7 @@ class Agent:
 
     @torch.no_grad()
     def critic_targets(self, batch: Batch) -> Tensor:
-        """What the critic stack regresses on, [3, B]: twice the soft return, then the constraint."""
+        """What the critics regress on, [3, B]: twice the soft return, then the constraint."""
         noise = self.noise(len(batch.returns))
         following, log_density = self.steps.next_values(batch.bootstraps, noise)
         soft = reward_target(
@@ -456,4 +370,4 @@ class Agent:
 class Trainer(off_policy.Trainer):
     """The off-policy loop around this file's `Agent`."""
 
-    agent_type = Agent
+    agent_type: ClassVar[Any] = Agent
