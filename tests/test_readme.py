@@ -1,0 +1,46 @@
+"""What the README says exists does exist."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+ROWS = re.findall(r"^\| .+ \| `(safemr[\w.]+)` \| `(tests/[\w.]+)` \|$", README, re.MULTILINE)
+
+
+def test_the_table_of_equations_was_found():
+    assert len(ROWS) >= 8
+
+
+@pytest.mark.parametrize(("function", "test"), ROWS)
+def test_each_equation_has_its_function_and_its_test(function, test):
+    names = function.split(".")
+    for split in range(len(names), 0, -1):
+        try:
+            value = importlib.import_module(".".join(names[:split]))
+        except ModuleNotFoundError:
+            continue
+        for name in names[split:]:
+            value = getattr(value, name)
+        break
+    assert value.__doc__
+    assert names[-1] in (ROOT / test).read_text()
+
+
+@pytest.mark.parametrize("document", ["README.md", "REPRODUCIBILITY.md"])
+def test_links_lead_somewhere(document):
+    links = re.findall(r"\]\(([^)#:]+)\)", (ROOT / document).read_text())
+    missing = [link for link in links if not (ROOT / link).exists()]
+    assert links and not missing
+
+
+def test_the_worked_example_is_an_algorithm_of_one_file():
+    from safemr import runs
+
+    assert runs.load_algorithm("sac_lagrangian").family == "off_policy"
+    assert "SAC-L: {algorithm: sac_lagrangian}" in README
