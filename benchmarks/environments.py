@@ -87,7 +87,7 @@ def measure_task(
         actions = generator.uniform(-1, 1, (steps, num_envs, 2)).astype(np.float32)
         raw.set_state(batched.get_state())
         measured = {
-            "raw": _raw_rate(raw, actions),
+            "raw": raw_rate(raw, actions),
             "batched": _rate(_step_batched, batched, actions),
             "scalar": _rate(_step_scalar, scalar, actions.reshape(-1, 2)),
         }
@@ -134,7 +134,7 @@ def _step_peer(env: Any, actions: np.ndarray) -> None:
             env.reset()
 
 
-def _raw_rate(batch: NavigationBatch, actions: np.ndarray) -> float:
+def raw_rate(batch: NavigationBatch, actions: np.ndarray) -> float:
     """The same for MuJoCo alone. Episodes end as in the environment, since a box that was just
     placed costs more than one at rest, but the resets themselves are not timed."""
     worlds = batch.worlds

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -23,8 +23,12 @@ import pandas as pd
 from safemr import falsification, reference
 from safemr.errors import UserError
 from safemr.feasibility import BRAKINGS, CONVENTIONS, analytic_condition
+from safemr.records import CONFIG, POLICY, PROGRESS, PROVENANCE, parse_progress, verify_record
 from safemr.reference import Zeta
 from safemr.tables import Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DEFAULT_TASK = "Pillars-0.15-Goal"
 DEFAULT_STATES = 2**16
@@ -55,22 +59,25 @@ def paper_certificates() -> list[Certificate]:
 def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any]]:
     """The certificate a run ended with, its task, and the task's settings.
 
-    Raises UserError where the record has no policy, or none of the energy-function family.
+    The last logged sigma, k and n; `policy` is None where the record has none (it is optional).
+    Raises UserError where there is no record, or none of the energy-function family.
     """
-    # Imported here for torch and numba, which parameters alone do not need.
+    # Imported here for numba, which parameters alone do not need.
     from safemr.aircraft import in_metres
-    from safemr.policies import load_policy
 
-    policy = load_policy(folder)
-    if "zeta" not in policy.extras:
+    verify_record(folder)
+    config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+    last = parse_progress((folder / PROGRESS).read_text(encoding="utf-8"))[-1]
+    if not last.keys() >= set(Zeta._fields):
         raise UserError(f"{folder}: its algorithm has no energy function to certify")
-    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    scale = float(policy.extras.get("length_scale", 1.0))
-    zeta = Zeta(*in_metres([float(value) for value in policy.extras["zeta"]], scale))
-    eta = float(config["algorithm"]["hyperparameters"].get("eta", 0.0)) * scale**zeta.n
-    name = f"{folder.parent.name} {folder.name.split('-')[0]}"
-    task = config["task"]
-    return Certificate(name, zeta, eta, folder), task["name"], dict(task.get("settings", {}))
+    hyperparameters, task = config["algorithm"]["hyperparameters"], config["task"]
+    scale = float(hyperparameters.get("length_scale", 1.0))
+    zeta = Zeta(*in_metres([last[name] for name in Zeta._fields], scale))
+    eta = float(hyperparameters.get("eta", 0.0)) * scale**zeta.n
+    variant = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["variant"]
+    name = f"{variant} (seed {config['seed']})"
+    policy = folder if (folder / POLICY).exists() else None
+    return Certificate(name, zeta, eta, policy), task["name"], dict(task.get("settings", {}))
 
 
 def certify(
@@ -79,13 +86,15 @@ def certify(
     *,
     states: int = DEFAULT_STATES,
     seed: int = 0,
+    episodes: int = 32,
     settings: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], falsification.Falsification]:
     """One row of the certificate table, and the search behind it.
 
     The row: certificate, task, sigma, k, n, eta, the margins of the four analytic verdicts [m/s^2],
     states searched, infeasible and leak share, worst margin, verdicts shared by the simulator, and,
-    with a policy, its violating and avoidable shares.
+    with a policy, its violating and avoidable shares in `episodes` episodes, of whose violating
+    steps at most 8 an episode are searched for a safe action.
     """
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
@@ -103,8 +112,9 @@ def certify(
         from safemr.policies import load_policy
 
         check = falsification.check_policy(
-            load_policy(certificate.policy), task, zeta, eta=eta, seed=seed, settings=settings
-        )
+            load_policy(certificate.policy), task, zeta, eta=eta, num_envs=episodes, seed=seed,
+            limit=8 * episodes, settings=settings,
+        )  # fmt: skip
         row |= {
             "policy_steps": check.steps,
             "policy_violating_share": check.violating_share,
@@ -184,6 +194,19 @@ def margin_map(
     return pd.DataFrame({"distance": places[:, 0], "bearing": places[:, 1], "margin": margin})
 
 
+def picture(jobs: Sequence[tuple[Certificate, str, Mapping[str, Any]]]) -> Figure:
+    """The analytic condition of certificates of one task, and the margins of the last of them."""
+    from safemr.plotting import certificate as drawing
+
+    mapped, task, _ = jobs[-1]
+    envs = falsification.make_simulator(task, 1)
+    d_min = float(envs.d_min)
+    envs.close()
+    zetas = {job[0].name: job[0].zeta for job in jobs}
+    margins = margin_map(task, mapped.zeta, eta=mapped.eta)
+    return drawing.certificate_check(zetas, d_min, margins, mapped.name)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """`safemr certify`; prints the table and, with --out, writes table, picture and examples."""
     options = _parser().parse_args(arguments)
@@ -231,21 +254,13 @@ def _write(
     jobs: Sequence[tuple[Certificate, str, Mapping[str, Any]]],
     searches: Sequence[falsification.Falsification],
 ) -> None:
-    from safemr.plotting import certificate as drawing
     from safemr.plotting import style
 
     table.write(folder)
     examples = {job[0].name: search.example() for job, search in zip(jobs, searches, strict=True)}
     text = json.dumps(examples, indent=1, sort_keys=True) + "\n"
     (folder / "examples.json").write_text(text, encoding="utf-8")
-    zetas = {job[0].name: job[0].zeta for job in jobs}
-    first, task, _ = jobs[0]
-    envs = falsification.make_simulator(task, 1)
-    chart = drawing.certificate_check(
-        zetas, float(envs.d_min), margin_map(task, first.zeta, eta=first.eta), first.name
-    )
-    envs.close()
-    style.save(chart, folder / "certificates")
+    style.save(picture([job for job in jobs if job[1] == jobs[0][1]]), folder / "certificates")
 
 
 def _replay(path: Path) -> int:

@@ -125,11 +125,13 @@ def parameter_evolution(
     names = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
     figure = style.new_figure(style.TEXT_WIDTH, 0.7 + 1.25 * len(tasks))
     axes = figure.subplots(len(tasks), 3, sharex="row", squeeze=False)
-    for row, task in zip(axes, tasks, strict=True):
+    for index, (row, task) in enumerate(zip(axes, tasks, strict=True)):
         for ax, (metric, symbol) in zip(row, names.items(), strict=True):
             chosen = progress[(progress["task"] == task) & (progress["metric"] == metric)]
             for variant in variants:
                 _seed_lines(chosen[chosen["variant"] == variant], ax, style.colour(variant))
+            if not chosen["variant"].isin(list(variants)).any():
+                _say_missing(ax, ["all runs"])
             for variant, zeta in (fixed or {}).items():
                 ax.axhline(zeta[metric], color=style.colour(variant), ls=style.line_style(variant))
             ax.set_ylabel(symbol, rotation=0, labelpad=6)
@@ -139,9 +141,8 @@ def parameter_evolution(
         row[0].set_title(task, loc="left")
         for ax in row[1:]:
             ax.set_title(" ", loc="left")
-        for ax in row:
-            if row is not axes[-1]:
-                ax.set_xlabel("")
+        for ax in row if index < len(tasks) - 1 else ():
+            ax.set_xlabel("")
     _legend(figure, [*variants, *(fixed or {})])
     return figure
 

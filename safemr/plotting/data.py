@@ -44,3 +44,12 @@ def load(path: Path | str) -> Arrays:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{path} is not readable rollout data: {error}") from error
+
+
+def below(arrays: Arrays, prefix: str) -> Arrays:
+    """The arrays whose names begin with `prefix`, under what follows it."""
+    return {
+        name.removeprefix(prefix): values
+        for name, values in arrays.items()
+        if name.startswith(prefix)
+    }

@@ -41,8 +41,10 @@ def trajectories(
 
     recorded: variant -> `rollouts.episodes` with the same seeds. The path has the variant's colour;
     crosses mark violating steps, small rings goals that were reached, and each panel states the
-    return collected.
+    return collected. Without any recording the figure says so.
     """
+    if not recorded:
+        return _nothing()
     columns = next(iter(recorded.values()))["robot"].shape[1]
     figure = style.new_figure(style.TEXT_WIDTH, 0.3 + 1.75 * len(recorded))
     axes = figure.subplots(len(recorded), columns, squeeze=False, sharex="col", sharey="col")
@@ -50,7 +52,10 @@ def trajectories(
         for episode, ax in enumerate(row):
             _draw_path(data, episode, steps, ax, draw_scene, style.colour(variant))
             total = float(data["reward"][:steps, episode].sum())
-            _frame(ax, f"return {total:.1f}")
+            _frame(ax, f"return {total:.1f}".replace("-", "\N{MINUS SIGN}"))
+            shown = [{**data, "robot": data["robot"][: steps + 1]} for data in recorded.values()]
+            view = _view(shown, episode)
+            ax.set(xlim=view[0], ylim=view[1])
         row[0].set_ylabel(style.label(variant), color=style.colour(variant))
     return figure
 
@@ -67,12 +72,13 @@ def animation(
 ) -> None:
     """A GIF of the variants side by side on one layout, in real time for stride 4 (80 ms a frame).
 
-    One palette serves all frames, which keeps the file small; it loops for ever.
+    One palette serves all frames, which keeps the file small; it loops for ever. Without any
+    recording it is one frame that says so.
     """
     frames = [
         _frame_image(recorded, draw_scene, episode, step, pixels)
         for step in range(0, steps + 1, stride)
-    ]
+    ] if recorded else [_pixels(_nothing())]  # fmt: skip
     width, height = frames[0].size
     sample = Image.new("RGB", (width, 3 * height))
     for place, frame in enumerate((frames[0], frames[len(frames) // 2], frames[-1])):
@@ -101,6 +107,10 @@ def _frame_image(
         _frame(ax, f"{style.label(variant)}: goals {goals}")
         ax.set(xlim=view[0], ylim=view[1])
     figure.set_dpi(dpi)
+    return _pixels(figure)
+
+
+def _pixels(figure: Figure) -> Image.Image:
     figure.canvas.draw()
     return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())  # type: ignore[attr-defined]
 
@@ -124,12 +134,19 @@ def _draw_path(
 
 
 def _view(recordings: Sequence[Arrays], episode: int) -> NDArray[np.float64]:
-    """[2, 2] limits of x and y that hold every robot and the task's square."""
+    """[2, 2] limits of x and y: the task's square, widened by up to half to hold every robot."""
     points = np.concatenate([data["robot"][:, episode, :2] for data in recordings])
     extent = float(recordings[0]["extent"])
-    low = np.minimum(points.min(0) - 0.2, -extent)
-    high = np.maximum(points.max(0) + 0.2, extent)
+    low = np.clip(points.min(0) - 0.2, -1.5 * extent, -extent)
+    high = np.clip(points.max(0) + 0.2, extent, 1.5 * extent)
     return np.stack([low, high], -1)
+
+
+@style.styled
+def _nothing() -> Figure:
+    figure = style.new_figure(style.COLUMN_WIDTH, 0.6)
+    figure.text(0.5, 0.5, "no policy recorded", ha="center", color="0.5", style="italic")
+    return figure
 
 
 def _frame(ax: Axes, title: str) -> None:

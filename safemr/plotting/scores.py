@@ -56,6 +56,8 @@ def return_against_cost(
     axes = figure.subplots(1, len(tasks), squeeze=False)[0]
     for ax, task in zip(axes, tasks, strict=True):
         draw_return_against_cost(wide[wide["task"] == task], ax, tolerance=tolerance)
+        if not (wide["task"] == task).any():
+            _say(ax, "no record")
         ax.set_title(task)
         ax.set_xlabel(cost_name)
     axes[0].set_ylabel("final return")
@@ -108,6 +110,8 @@ def aggregate_scores(
     figure = style.new_figure(style.TEXT_WIDTH, 2.3)
     left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
     draw_profiles(aggregates.profiles, left)
+    if not aggregates.profiles:
+        _say(left, "no algorithm has runs on every task")
     left.set_xlabel(rf"normalised {name} $\tau$ (paper's SafeMR: 1)")
     draw_intervals(aggregates.iqm, middle, neutral=1.0)
     middle.set_xlabel(f"IQM of normalised {name}")
@@ -123,3 +127,7 @@ def aggregate_scores(
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=8)
     return figure
+
+
+def _say(ax: Axes, text: str) -> None:
+    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", color="0.5", style="italic")

@@ -1,22 +1,27 @@
 # Tables and figures of the navigation grid.
 GRID = {"tasks": list(CONFIG.tasks), "variants": [*CONFIG.algorithms, *CONFIG.outside]}
+TABLES = {"table1": "../report/table_1.rst", "results": "../report/results.rst"}
+if any(task.endswith("-Push") for task in CONFIG.tasks):
+    TABLES["push_split"] = "../report/push_split.rst"
 
 
 rule table_1:
     input:
         scores=rules.aggregate.output.scores,
         runs=rules.aggregate.output.runs,
+        controllers=rules.controllers.output[0],
     output:
-        expand(f"{RESULTS}/tables/table1.{{end}}", end=["csv", "tex"]),
-        report(f"{RESULTS}/tables/table1.md", caption="../report/table_1.rst", category="Tables"),
-        expand(f"{RESULTS}/tables/results.{{end}}", end=["csv", "md", "tex"]),
+        *[report(f"{RESULTS}/tables/{name}.md", caption=caption, category="Tables")
+          for name, caption in TABLES.items()],
+        table=expand(f"{RESULTS}/tables/{{name}}.{{end}}", name=TABLES, end=["csv", "tex"]),
     log:
         f"{LOGS}/table_1.log",
     threads: 1
     params:
         **GRID,
+        **BUDGET,
+        push="push_split" in TABLES,
         expected=expected((*PLAN.navigation, *PLAN.outside)),
-        folder=f"{RESULTS}/tables",
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
     script:
@@ -43,3 +48,110 @@ rule training_curves:
 
 
 TARGETS += [*rules.table_1.output, *rules.training_curves.output]
+
+
+def figure_outputs(*names):
+    """PDFs, and PNGs that the report shows, each with the caption of its name."""
+    captions = {name: f"../report/{name.partition('/')[0]}.rst" for name in names}
+    shown = [report(f"{FIGURES}/{name}.png", caption=caption, category="Figures")
+             for name, caption in captions.items()]
+    return {"pdf": [f"{FIGURES}/{name}.pdf" for name in names], "png": shown}
+
+
+# Illustrations: the paper's numbers and the tasks themselves, no record.
+rule illustrations:
+    output:
+        **figure_outputs("energy_and_safe_set", "narrow_passage", "environments"),
+    log:
+        f"{LOGS}/illustrations.log",
+    threads: 1
+    params:
+        tasks=ROBOT_TASKS,
+    script:
+        "../scripts/illustrations.py"
+
+
+rule final_scores:
+    input:
+        scores=rules.aggregate.output.scores,
+    output:
+        **figure_outputs("return_against_cost", "aggregate_scores", "aggregate_safe_scores"),
+    log:
+        f"{LOGS}/final_scores.log",
+    threads: 1
+    params:
+        **GRID,
+        **BUDGET,
+        tolerance=CONFIG.cost_tolerance,
+        clean_share=CONFIG.zero_violation_share,
+    script:
+        "../scripts/final_scores.py"
+
+
+rule parameters:
+    input:
+        progress=rules.aggregate.output.progress,
+    output:
+        **figure_outputs("parameters"),
+    log:
+        f"{LOGS}/parameters.log",
+    threads: 1
+    params:
+        **BUDGET,
+        tasks=GRID["tasks"],
+        learned=LEARNED,
+    script:
+        "../scripts/parameters.py"
+
+
+# What drawings need of the trained policies. policy.npz is optional in a record and hence no input:
+# which ones are missing is written down beside the figures that lack them.
+rule rollouts:
+    input:
+        lambda wildcards: record_files(
+            run for run in FIRST_RUNS.values() if run.task == wildcards.task
+        ),
+    output:
+        f"{SUMMARY}/rollouts/{{task}}.npz",
+    log:
+        f"{LOGS}/rollouts/{{task}}.log",
+    wildcard_constraints:
+        task=one_of(ROBOT_TASKS),
+    threads: 1
+    params:
+        root=RESULTS,
+        folders=lambda wildcards: {
+            variant: FIRST_RUNS[wildcards.task, variant].path.as_posix()
+            for variant in LEARNED
+            if (wildcards.task, variant) in FIRST_RUNS
+        },
+        settings=lambda wildcards: SETTINGS.get(wildcards.task, {}),
+        layouts=[CONFIG.evaluation.seed + index for index in range(4)],
+        steps=400,
+    script:
+        "../scripts/rollouts.py"
+
+
+rule policies:
+    input:
+        expand(rules.rollouts.output[0], task=ROBOT_TASKS),
+    output:
+        **figure_outputs("multiplier_maps", *(f"trajectories/{task}" for task in ROBOT_TASKS)),
+        animation=f"{FIGURES}/rollout.gif",
+        missing=f"{SUMMARY}/missing_policies.csv",
+    log:
+        f"{LOGS}/policies.log",
+    threads: 1
+    params:
+        tasks=ROBOT_TASKS,
+        variants=LEARNED,
+        steps=300,
+    script:
+        "../scripts/policies.py"
+
+
+TARGETS += [*rules.illustrations.output, *rules.final_scores.output]
+if LEARNED:
+    TARGETS += [*rules.parameters.output]
+if LEARNED and ROBOT_TASKS:
+    TARGETS += [*rules.policies.output]

@@ -1,14 +1,23 @@
-"""Table I and the full results."""
+"""Table I, the full results, and the parts of the Push returns."""
+
+from pathlib import Path
 
 import pandas as pd
 
 from safemr import statistics, tables
 
-params = snakemake.params
-scores = pd.read_csv(snakemake.input.scores)
-scores = scores[scores["task"].isin(params.tasks) & scores["variant"].isin(params.variants)]
+given, params = snakemake.input, snakemake.params
+learned = pd.read_csv(given.scores)
+learned = learned[learned["task"].isin(params.tasks) & learned["variant"].isin(params.variants)]
+scores = pd.concat([learned, pd.read_csv(given.controllers)], ignore_index=True)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
-missing = statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs))
+missing = statistics.missing_runs(expected, pd.read_csv(given.runs))
 rule = tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
-tables.table_one(scores, missing=missing, rule=rule, tasks=params.tasks).write(params.folder)
-tables.full_results(scores, missing=missing, rule=rule).write(params.folder)
+made = [
+    tables.table_one(learned, missing=missing, rule=rule, tasks=params.tasks),
+    tables.full_results(scores, missing=missing, rule=rule),
+]
+if params.push:
+    made.append(tables.push_split(scores, missing=missing))
+for table in made:
+    table.write(Path(snakemake.output.table[0]).parent)

@@ -1,0 +1,335 @@
+"""How near a training run is to the least time its own arithmetic and physics need.
+
+    python -m benchmarks.training [--algorithms ...] [--task NAME] [--blocks N] [--output FILE.csv]
+
+The floor of a part of the program is the time of what it cannot avoid: raw ``mj_step`` from the
+run's own states for the environment, and its matrix products, each timed alone at its own shape,
+by whichever of PyTorch and scipy's BLAS is faster. Everything else is counted as overhead:
+activations, biases, losses, Adam, gathering samples, sensors, resets, Python. The products are
+those that the ``torch`` backend asks PyTorch for, recorded while it trains, without the gradients
+with respect to observations, which nothing needs and the ``fused`` backend leaves out.
+
+Times are CPU time of this process, per 1,000 environment steps, with a replay memory as full as in
+the middle of a long run; backends take turns block by block, and the table shows medians of blocks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import functools
+import importlib
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from benchmarks.environments import raw_rate
+from envs.navigation_batch import NavigationBatch
+from envs.tasks import NAVIGATION_TASKS
+from safemr.evaluate import evaluate
+from safemr.runs import load_algorithm
+from safemr.train import make_envs
+
+OFF_POLICY = ("safemr", "joint_sis", "fac", "sac_lagrangian")
+ON_POLICY = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
+COLUMNS = ("algorithm", "backend", "part", "ms", "floor_ms", "mflop")
+REST = "loop, logging"
+
+# Part of the program -> where it is done, for each family; times of nested parts are exclusive.
+PARTS = {
+    "off_policy": {
+        "environment": ("envs", "step"),
+        "inference": ("agent", "act"),
+        "storing": ("replay", "add"),
+        "gathering": ("replay", "sample"),
+        "targets": ("agent", "critic_targets"),
+        "critic step": ("agent.steps", "update_critics"),
+        "actor, multiplier step": ("agent.steps", "update_policy"),
+        "target networks": ("agent.steps", "follow_critics"),
+        "certificate": ("agent", "update_certificate"),
+        "update, other": ("agent", "update"),
+        "episode statistics": ("_episodes", "update"),
+    },
+    "on_policy": {
+        "environment": ("envs", "step"),
+        "inference, storing": ("", "_collect"),
+        "values, advantages": ("", "_batch"),
+        "policy update": ("", "update_policy"),
+        "critic step": ("", "_fit_critics"),
+        "episode statistics": ("statistics", "update"),
+    },
+}
+
+
+class Stopwatch:
+    """CPU seconds by part; a part does not include the parts inside it."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+        self.parts = [REST]
+        self._last = time.process_time()
+
+    def _lap(self) -> None:
+        now = time.process_time()
+        self.spent[self.parts[-1]] += now - self._last
+        self._last = now
+
+    def reset(self) -> None:
+        self._lap()
+        self.spent.clear()
+
+    def watch(self, trainer: Any) -> None:
+        """Times the methods of PARTS that this trainer has."""
+        for part, (path, method) in PARTS[trainer.family].items():
+            owner = functools.reduce(getattr, filter(None, path.split(".")), trainer)
+            setattr(owner, method, self._timed(part, getattr(owner, method)))
+
+    def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **keywords: Any) -> Any:
+            self._lap()
+            self.parts.append(part)
+            try:
+                return function(*arguments, **keywords)
+            finally:
+                self._lap()
+                self.parts.pop()
+
+        return timed
+
+
+Product = tuple[torch.Size, tuple[int, ...], torch.Size, tuple[int, ...]]
+
+
+class Products(TorchDispatchMode):
+    """Counts matrix products by part, shape and layout."""
+
+    def __init__(self, stopwatch: Stopwatch) -> None:
+        super().__init__()
+        self.counts: Counter[tuple[str, Product]] = Counter()
+        self._stopwatch = stopwatch
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        aten = torch.ops.aten
+        first = {aten.mm: 0, aten.bmm: 0, aten.addmm: 1, aten.baddbmm: 1}.get(func.overloadpacket)
+        if first is not None:
+            a, b = (x if x.dim() == 3 else x[None] for x in args[first : first + 2])
+            product = (a.shape, a.stride(), b.shape, b.stride())
+            self.counts[self._stopwatch.parts[-1], product] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@numba.njit
+def _dot(a: Any, b: Any, out: Any, repeats: int) -> None:
+    for _ in range(repeats):
+        for member in range(len(a)):
+            np.dot(a[member], b[member], out[member])
+
+
+def _random(shape: torch.Size, stride: tuple[int, ...]) -> torch.Tensor:
+    """Normal numbers in the same layout; stride 0 is an operand that all members share."""
+    shared = torch.Size(1 if step == 0 else size for size, step in zip(shape, stride, strict=True))
+    return torch.empty_strided(shared, stride).normal_().expand(shape)
+
+
+def product_seconds(product: Product, repeats: int = 20, rounds: int = 3) -> float:
+    """CPU seconds of one product by the faster of PyTorch, as it was asked for it, and scipy."""
+    shape_a, stride_a, shape_b, stride_b = product
+    a, b = _random(shape_a, stride_a), _random(shape_b, stride_b)
+    out = torch.empty(shape_a[0], shape_a[1], shape_b[2])
+    plain = a.contiguous().numpy(), b.contiguous().numpy(), out.numpy().copy()
+    _dot(*plain, 1)
+    best = np.inf
+    for _ in range(rounds):
+        begun = time.process_time()
+        for _ in range(repeats):
+            torch.bmm(a, b, out=out)
+        middle = time.process_time()
+        _dot(*plain, repeats)
+        best = min(best, middle - begun, time.process_time() - middle)
+    return best / repeats
+
+
+def flop(product: Product) -> float:
+    shape_a, _, shape_b, _ = product
+    return 2.0 * shape_a.numel() * shape_b[2]
+
+
+class Run:
+    """A trainer in the middle of a run, and its stopwatch."""
+
+    def __init__(self, algorithm: str, task: str, held: int, backend: str | None) -> None:
+        module = importlib.import_module(f"safemr.algorithms.{algorithm}")
+        settings: dict[str, Any] = {"backend": backend, "start_steps": 512} if backend else {}
+        if hasattr(module.Config, "certificate_start"):
+            settings["certificate_start"] = 0.0
+        config = module.Config(**settings)
+        environments = functools.partial(make_envs, {"name": task, "settings": {}})
+        self.trainer = module.Trainer(config, environments, 100, 10**7)
+        self.algorithm, self.backend = algorithm, backend
+        # One block: enough for every kind of update, a whole epoch where there are epochs.
+        self.block = 1024 if backend else config.epoch_steps
+        self.trainer.advance(2048 if backend else self.block)
+        if backend:
+            self._fill_memory(held)
+        self.stopwatch = Stopwatch()
+        self.stopwatch.watch(self.trainer)
+
+    def _fill_memory(self, held: int) -> None:
+        """Repeats the experience so far: where the samples lie decides how long gathering takes."""
+        replay = self.trainer.replay
+        state = replay.state_dict()
+        times = min(held // replay.num_envs, replay.capacity - 1) // state["size"]
+        fields = {
+            name: values.repeat(times, *[1] * (values.dim() - 1))
+            for name, values in state["fields"].items()
+        }
+        size = times * state["size"]
+        replay.load_state_dict({"head": size, "size": size, "fields": fields})
+
+    def advance(self) -> dict[str, float]:
+        """CPU milliseconds by part per 1,000 steps of one block."""
+        trainer, before = self.trainer, self.trainer.step
+        self.stopwatch.reset()
+        trainer.advance(before + self.block)
+        self.stopwatch._lap()
+        steps = trainer.step - before
+        return {part: 1e6 * spent / steps for part, spent in self.stopwatch.spent.items()}
+
+    def products(self, blocks: int = 2) -> dict[tuple[str, Product], float]:
+        """Matrix products per 1,000 steps."""
+        trainer, before = self.trainer, self.trainer.step
+        with Products(self.stopwatch) as products:
+            for _ in range(blocks):
+                trainer.advance(trainer.step + self.block)
+        counts: dict[tuple[str, Product], float] = defaultdict(float)
+        for (part, product), count in products.counts.items():
+            counts[part, self._needed(part, product)] += 1e3 * count / (trainer.step - before)
+        return counts
+
+    def _needed(self, part: str, product: Product) -> Product:
+        """Of the gradient with respect to a critic's input, the columns of the action."""
+        shape_a, stride_a, shape_b, stride_b = product
+        if part == "actor, multiplier step" and len(shape_b) == 3:
+            agent = self.trainer.agent
+            inputs = agent.critics.shape.sizes[0]
+            gradient = shape_b == (agent.critics.shape.count, agent.config.hidden, inputs)
+            if gradient and stride_b == (agent.config.hidden * inputs, inputs, 1):
+                columns = torch.Size((*shape_b[:2], agent.action_dim))
+                width = agent.action_dim
+                return shape_a, stride_a, columns, (agent.config.hidden * width, width, 1)
+        return product
+
+    def physics_ms(self, task: str, rounds: int = 3, steps: int = 40) -> float:
+        """CPU milliseconds of 1,000 raw steps from the states that training is in."""
+        envs = self.trainer.envs.unwrapped
+        raw = NavigationBatch(NAVIGATION_TASKS[task], envs.num_envs)
+        rng = np.random.default_rng(0)
+        rates = []
+        for _ in range(rounds):
+            raw.set_state(envs.get_state())
+            actions = rng.uniform(-1, 1, (steps, envs.num_envs, 2)).astype(np.float32)
+            rates.append(raw_rate(raw, actions))
+        return 1e6 / median(rates)
+
+
+def measure(algorithm: str, task: str, blocks: int, held: int) -> list[dict[str, Any]]:
+    """Rows of COLUMNS for one algorithm: parts, then the evaluation of a policy."""
+    family = load_algorithm(algorithm).family
+    backends = ("torch", "fused") if family == "off_policy" else (None,)
+    runs = [Run(algorithm, task, held, backend) for backend in backends]
+    products = runs[0].products()
+    times: list[dict[str, list[float]]] = [defaultdict(list) for _ in runs]
+    floors: dict[str, list[float]] = defaultdict(list)
+    for _ in range(blocks):
+        # Taken in turn with training: the machine's speed changes with what its other users do.
+        floor: dict[str, float] = defaultdict(float, environment=runs[0].physics_ms(task))
+        for (part, product), count in products.items():
+            floor[part] += 1e3 * count * product_seconds(product)
+        for part, spent in floor.items():
+            floors[part].append(spent)
+        for run, found in zip(runs, times, strict=True):
+            for part, spent in run.advance().items():
+                found[part].append(spent)
+    work: dict[str, float] = defaultdict(float)
+    for (part, product), count in products.items():
+        work[part] += 1e-6 * count * flop(product)
+    rows = []
+    for run, found in zip(runs, times, strict=True):
+        for part in (*PARTS[family], REST):
+            spent, floor = (median(values[part] or [0.0]) for values in (found, floors))
+            values = (algorithm, run.backend or "torch", part, spent, floor, work[part])
+            rows.append(dict(zip(COLUMNS, values, strict=True)))
+    return rows
+
+
+def measure_evaluation(task: str, episodes: int) -> dict[str, Any]:
+    """The row of a deterministic evaluation, whose floor is the physics alone."""
+    run = Run("fac", task, 1, "fused")
+    envs = make_envs({"name": task, "settings": {}}, episodes)
+    begun = time.process_time()
+    result = evaluate(run.trainer.policy, envs, 10_000)
+    steps = result["episodes"] * result["length"]
+    spent = 1e6 * (time.process_time() - begun) / steps
+    run.trainer.envs = envs
+    values = ("any", "-", "evaluation", spent, run.physics_ms(task), 0.0)
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """A table a case: parts, their times and floors, and the ratio of the sums."""
+    lines = []
+    for key in dict.fromkeys((row["algorithm"], row["backend"]) for row in rows):
+        chosen = [row for row in rows if (row["algorithm"], row["backend"]) == key]
+        lines += [f"\n{key[0]}, backend {key[1]}: CPU ms per 1,000 environment steps\n"]
+        lines += ["| part | measured | floor | MFLOP | GFLOP/s |", "|" + " --- |" * 5]
+        total = {name: sum(row[name] for row in chosen) for name in COLUMNS[3:]}
+        for row in [*chosen, {"part": "**all**", **total}]:
+            rate = f"{row['mflop'] / row['ms']:.0f}" if row["mflop"] > 1 else "-"
+            lines.append(
+                f"| {row['part']} | {row['ms']:.1f} | {row['floor_ms']:.1f} "
+                f"| {row['mflop']:.0f} | {rate} |"
+            )
+        lines.append(f"\nmeasured / floor = {total['ms'] / total['floor_ms']:.2f}")
+    return "\n".join(lines)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.training", description=__doc__)
+    every = (*OFF_POLICY, *ON_POLICY)
+    parser.add_argument("--algorithms", nargs="+", choices=every, default=every)
+    parser.add_argument("--task", choices=NAVIGATION_TASKS, default="Pillars-0.15-Goal")
+    parser.add_argument("--blocks", type=int, default=9)
+    parser.add_argument("--held", type=int, default=150_000, help="transitions in the memory")
+    parser.add_argument("--episodes", type=int, default=20, help="of the evaluation")
+    parser.add_argument("--output", type=Path, help="write the rows as CSV, too")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    rows = []
+    for algorithm in options.algorithms:
+        blocks = options.blocks if algorithm in OFF_POLICY else max(options.blocks // 3, 1)
+        found = measure(algorithm, options.task, blocks, options.held)
+        print(markdown(found), flush=True)
+        rows += found
+    found = [measure_evaluation(options.task, options.episodes)]
+    print(markdown(found))
+    if options.output is not None:
+        with options.output.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(rows + found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

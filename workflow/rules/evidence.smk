@@ -1,0 +1,92 @@
+# What the learned numbers are read against: scripted controllers, the check of the certificates,
+# and the verdicts on the paper's claims.
+ROBOT_TASKS = [task for task in CONFIG.tasks if task.endswith(("-Goal", "-Push"))]
+SETTINGS = {task: dict(entry.settings) for task, entry in CONFIG.task_overrides.items()}
+BUDGET = {"seeds": list(CONFIG.seeds), "steps": dict(CONFIG.budget)}  # for captions
+
+# Variants whose certificate is learned, and of each the first recorded run on each task.
+LEARNED = [
+    label for label, entry in CONFIG.algorithms.items() if entry.algorithm in ("safemr", "joint_sis")
+]
+FIRST_RUNS = {}
+for entry in (*PLAN.navigation, *PLAN.sensitivity):
+    learns = entry.variant in (*LEARNED, *PLAN.points)
+    if learns and entry.task in ROBOT_TASKS and entry in RECORDED:
+        FIRST_RUNS.setdefault((entry.task, entry.variant), entry)
+
+
+rule controllers:
+    output:
+        f"{SUMMARY}/controllers.csv",
+    log:
+        f"{LOGS}/controllers.log",
+    threads: 1
+    params:
+        tasks=ROBOT_TASKS,
+        settings=SETTINGS,
+        seeds=min(5, CONFIG.evaluation.episodes),
+        episodes=CONFIG.evaluation.episodes,
+    message:
+        "Evaluating the scripted controllers"
+    script:
+        "../scripts/controllers.py"
+
+
+rule certificates:
+    input:
+        record_files(FIRST_RUNS.values()),
+    output:
+        table=expand(f"{RESULTS}/tables/certificates.{{end}}", end=["csv", "tex"]),
+        markdown=report(
+            f"{RESULTS}/tables/certificates.md",
+            caption="../report/certificates.rst",
+            category="Tables",
+        ),
+        examples=f"{RESULTS}/tables/certificate_examples.json",
+        pdf=f"{FIGURES}/certificates.pdf",
+        png=report(
+            f"{FIGURES}/certificates.png",
+            caption="../report/certificates.rst",
+            category="Figures",
+        ),
+    log:
+        f"{LOGS}/certificates.log",
+    threads: 1
+    params:
+        root=RESULTS,
+        folders=[run.path.as_posix() for run in FIRST_RUNS.values()],
+        pictured=[run.path.as_posix() for run in FIRST_RUNS.values() if run.variant in LEARNED],
+        states=2**13,
+        episodes=min(8, CONFIG.evaluation.episodes),
+    message:
+        "Checking the paper's certificates and %d learned ones" % len(FIRST_RUNS)
+    script:
+        "../scripts/certificates.py"
+
+
+rule claims:
+    input:
+        scores=rules.aggregate.output.scores,
+        progress=rules.aggregate.output.progress,
+        certificates=rules.certificates.output.table[0],
+        aircraft=f"{SUMMARY}/aircraft.csv" if CONFIG.aircraft else [],
+    output:
+        table=expand(f"{RESULTS}/tables/claims.{{end}}", end=["csv", "tex"]),
+        markdown=report(
+            f"{RESULTS}/tables/claims.md", caption="../report/claims.rst", category="Claims"
+        ),
+    log:
+        f"{LOGS}/claims.log",
+    threads: 1
+    params:
+        **BUDGET,
+        tasks=list(CONFIG.tasks),
+        expected=expected((*PLAN.navigation, *PLAN.sensitivity, *PLAN.outside)),
+        points={label: list(point) for label, point in PLAN.points.items()},
+        tolerance=CONFIG.cost_tolerance,
+        clean_share=CONFIG.zero_violation_share,
+    script:
+        "../scripts/claims.py"
+
+
+TARGETS += [*rules.certificates.output, *rules.claims.output]
