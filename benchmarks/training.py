@@ -78,13 +78,13 @@ class Stopwatch:
         self.parts = [REST]
         self._last = time.process_time()
 
-    def _lap(self) -> None:
+    def lap(self) -> None:
         now = time.process_time()
         self.spent[self.parts[-1]] += now - self._last
         self._last = now
 
     def reset(self) -> None:
-        self._lap()
+        self.lap()
         self.spent.clear()
 
     def watch(self, trainer: Any) -> None:
@@ -95,12 +95,12 @@ class Stopwatch:
 
     def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*arguments: Any, **keywords: Any) -> Any:
-            self._lap()
+            self.lap()
             self.parts.append(part)
             try:
                 return function(*arguments, **keywords)
             finally:
-                self._lap()
+                self.lap()
                 self.parts.pop()
 
         return timed
@@ -117,9 +117,7 @@ class Products(TorchDispatchMode):
         self.counts: Counter[tuple[str, Product]] = Counter()
         self._stopwatch = stopwatch
 
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         aten = torch.ops.aten
         first = {aten.mm: 0, aten.bmm: 0, aten.addmm: 1, aten.baddbmm: 1}.get(func.overloadpacket)
         if first is not None:
@@ -202,7 +200,7 @@ class Run:
         trainer, before = self.trainer, self.trainer.step
         self.stopwatch.reset()
         trainer.advance(before + self.block)
-        self.stopwatch._lap()
+        self.stopwatch.lap()
         steps = trainer.step - before
         return {part: 1e6 * spent / steps for part, spent in self.stopwatch.spent.items()}
 
@@ -282,25 +280,44 @@ def measure_evaluation(task: str, episodes: int) -> dict[str, Any]:
     steps = result["episodes"] * result["length"]
     spent = 1e6 * (time.process_time() - begun) / steps
     run.trainer.envs = envs
-    values = ("any", "-", "evaluation", spent, run.physics_ms(task), 0.0)
+    values = ("evaluation", "-", "evaluation", spent, run.physics_ms(task), 0.0)
     return dict(zip(COLUMNS, values, strict=True))
 
 
+def cases(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+    """Rows by algorithm and backend, the sum of the parts last."""
+    found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        found[row["algorithm"], row["backend"]].append(row)
+    for parts in found.values():
+        total = {name: sum(row[name] for row in parts) for name in COLUMNS[3:]}
+        parts.append({"part": "all", **total})
+    return found
+
+
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """A table a case: parts, their times and floors, and the ratio of the sums."""
+    """A table a case: parts, their times and floors."""
     lines = []
-    for key in dict.fromkeys((row["algorithm"], row["backend"]) for row in rows):
-        chosen = [row for row in rows if (row["algorithm"], row["backend"]) == key]
-        lines += [f"\n{key[0]}, backend {key[1]}: CPU ms per 1,000 environment steps\n"]
+    for (algorithm, backend), parts in cases(rows).items():
+        lines += [f"\n{algorithm}, backend {backend}: CPU ms per 1,000 environment steps\n"]
         lines += ["| part | measured | floor | MFLOP | GFLOP/s |", "|" + " --- |" * 5]
-        total = {name: sum(row[name] for row in chosen) for name in COLUMNS[3:]}
-        for row in [*chosen, {"part": "**all**", **total}]:
+        for row in parts:
             rate = f"{row['mflop'] / row['ms']:.0f}" if row["mflop"] > 1 else "-"
             lines.append(
                 f"| {row['part']} | {row['ms']:.1f} | {row['floor_ms']:.1f} "
                 f"| {row['mflop']:.0f} | {rate} |"
             )
-        lines.append(f"\nmeasured / floor = {total['ms'] / total['floor_ms']:.2f}")
+    return "\n".join(lines)
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """One line a case."""
+    header = ("algorithm", "backend", "measured", "floor", "measured / floor")
+    lines = ["\n| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    for case, parts in cases(rows).items():
+        spent, floor = parts[-1]["ms"], parts[-1]["floor_ms"]
+        cells = (*case, f"{spent:.0f}", f"{floor:.0f}", f"{spent / floor:.2f}")
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -318,16 +335,16 @@ def main(arguments: list[str] | None = None) -> int:
     rows = []
     for algorithm in options.algorithms:
         blocks = options.blocks if algorithm in OFF_POLICY else max(options.blocks // 3, 1)
-        found = measure(algorithm, options.task, blocks, options.held)
-        print(markdown(found), flush=True)
-        rows += found
-    found = [measure_evaluation(options.task, options.episodes)]
-    print(markdown(found))
+        rows += measure(algorithm, options.task, blocks, options.held)
+        print(f"{algorithm} measured", file=sys.stderr, flush=True)
+    rows.append(measure_evaluation(options.task, options.episodes))
+    print(markdown(rows))
+    print(summary(rows))
     if options.output is not None:
         with options.output.open("w", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
-            writer.writerows(rows + found)
+            writer.writerows(rows)
     return 0
 
 

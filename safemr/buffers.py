@@ -63,7 +63,7 @@ class Replay:
         size, where = capacity * num_envs, torch.device(device)
 
         def table(*shape: int) -> Tensor:
-            # unlike torch's, numpy's zeros take memory only where something was stored
+            # numpy asks the system for huge pages, from which random rows are read faster
             return torch.from_numpy(np.zeros((size, *shape), np.float32)).to(where)
 
         self._fields = {

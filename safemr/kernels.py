@@ -281,10 +281,8 @@ def _squash(output: Floats, noise: Floats) -> tuple[Floats, Floats]:
         for a in range(size):
             log_std = min(max(output[size + a, b], _LOG_STD_MIN), _LOG_STD_MAX)
             u = output[a, b] + math.exp(log_std) * noise[b, a]
-            # tanh(u) and u + softplus(-2u) = |u| + log(1 + exp(-2|u|)) share their exponential
-            tail = math.exp(-_2 * abs(u))
-            total += log_std + _HALF * noise[b, a] ** 2 - _2 * (abs(u) + math.log1p(tail))
-            actions[b, a] = math.copysign((_1 - tail) / (_1 + tail), u)
+            total += log_std + _HALF * noise[b, a] ** 2 - _2 * (u + _softplus(-_2 * u))
+            actions[b, a] = math.tanh(u)
         log_densities[b] = -total
     return actions, log_densities
 

@@ -51,7 +51,7 @@ def test_behaviour_changes_only_with_the_version(name):
     for metric, value in stored["metrics"].items():
         scale = max(abs(value), 1e-3)
         assert abs(now["metrics"][metric] - value) <= TOLERANCE * scale, (
-            f"{name}: {metric} is {now['metrics'][metric]}, was {value} at the same VERSION; {remedy}"
+            f"{name}: {metric} is {now['metrics'][metric]}, was {value}; {remedy}"
         )
 
 

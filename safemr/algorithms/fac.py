@@ -299,9 +299,9 @@ class Agent:
         """
         config, steps = self.config, self.steps
         targets = self.critic_targets(drawn)
-        self._set_learning_rates()
         info: Info = {}
         for batch, target in zip(drawn.split(parts), targets.chunk(parts, 1), strict=True):
+            self._set_learning_rates()
             self.updates += 1
             info |= steps.update_critics(batch, target, measure)
             if self.updates % config.policy_delay == 0:
