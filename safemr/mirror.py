@@ -49,10 +49,13 @@ class Mirror(contextlib.AbstractContextManager["Mirror"]):
         import wandb
 
         task, seed = self._config["task"]["name"], self._config["seed"]
+        # Beside the run's working folder, which is removed when the record is written.
+        folder = self._session.work.parents[1] / "wandb"
+        folder.mkdir(parents=True, exist_ok=True)
         self._run = wandb.init(
             project=self._project,
             mode=self._mode,
-            dir=str(self._session.work),
+            dir=str(folder),
             group=f"{task}/{self._session.variant}",
             name=f"{task}/{self._session.variant}/seed{seed}",
             id=f"{self._session.digest}-{len(self._session.rows)}",

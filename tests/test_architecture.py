@@ -43,16 +43,16 @@ def _deferred(node: ast.stmt) -> bool:
 
 def reached(start: str) -> set[str]:
     """Top-level imports of a module of this repository, followed through the repository."""
-    names, todo = set(), [start]
-    while todo:
-        name = todo.pop()
+    names, pending = set(), [start]
+    while pending:
+        name = pending.pop()
         if name in names:
             continue
         names.add(name)
         for suffix in (".py", "/__init__.py"):
             path = Path(name.replace(".", "/") + suffix)
             if (ROOT / path).is_file():
-                todo += imports(path, top_level=True)
+                pending += imports(path, top_level=True)
     return names
 
 
