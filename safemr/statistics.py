@@ -321,6 +321,21 @@ def learning_curves(progress: pd.DataFrame, metric: str, *, window: int = 1) -> 
     return pd.DataFrame(rows, columns=["task", "variant", "step", "mean", "low", "high", "count"])
 
 
+def core_minutes(progress: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Processor minutes that a run had taken at each logged step, averaged over seeds.
+
+    The log holds wall time; a run's processor time is spread over it evenly, so that a busy machine
+    does not make an algorithm look slow. runs: the runs table with wall_s and cpu_s. Returns task,
+    variant, step, minutes.
+    """
+    keys = ["task", "variant", "seed"]
+    clock = progress[progress["metric"] == "time_wall_s"].merge(
+        runs.assign(busy=runs["cpu_s"] / runs["wall_s"])[[*keys, "busy"]], on=keys
+    )
+    clock["minutes"] = clock["value"] * clock["busy"] / 60
+    return clock.groupby(["task", "variant", "step"], sort=False)["minutes"].mean().reset_index()
+
+
 def missing_runs(expected: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Rows (task, variant, seed) of `expected` that `runs` lacks, in the order expected."""
     keys = ["task", "variant", "seed"]

@@ -98,7 +98,9 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
         "heading": np.array(0.0), "obstacle_size": np.array(0.15), "d_min": np.array(D_MIN),
         "goal_size": np.array(0.3), "extent": np.array(2.0),
     }  # fmt: skip
+    minutes = returns[["task", "variant", "step"]].assign(minutes=returns["step"] / 100)
     return {
+        "computing time": lambda: curves.compute_curves(returns, minutes, TASKS),
         "training": lambda: curves.training_curves(returns, costs, TASKS),
         "missing task": lambda: curves.training_curves(returns, costs, (*TASKS, "Elsewhere")),
         "no run": lambda: curves.training_curves(returns.iloc[:0], costs.iloc[:0], TASKS),

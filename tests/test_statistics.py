@@ -200,6 +200,18 @@ def test_aggregates_leave_out_variants_that_lack_a_task():
     assert result.improvement["B"].mean == pytest.approx((0.75 + 1.0) / 2)
 
 
+def test_core_minutes_scale_wall_time_by_the_share_of_a_processor():
+    wall = {("T", "A", 0): [60.0, 120.0], ("T", "A", 1): [60.0, 240.0]}
+    runs = pd.DataFrame(
+        {"task": "T", "variant": "A", "seed": [0, 1], "wall_s": [120.0, 240.0],
+         "cpu_s": [120.0, 120.0]}
+    )  # fmt: skip
+    found = statistics.core_minutes(tidy(wall, "time_wall_s"), runs)
+    # seed 1 had half a processor
+    np.testing.assert_allclose(found["minutes"], [(1 + 0.5) / 2, (2 + 2) / 2])
+    assert found["step"].tolist() == [10, 20]
+
+
 def test_missing_runs_are_listed_in_the_expected_order():
     expected = pd.DataFrame(
         [("t", "A", 0), ("t", "A", 1), ("u", "B", 0)], columns=["task", "variant", "seed"]

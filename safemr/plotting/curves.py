@@ -77,6 +77,26 @@ def training_curves(
 
 
 @style.styled
+def compute_curves(
+    returns: pd.DataFrame, minutes: pd.DataFrame, tasks: Sequence[str], *, name: str = "return"
+) -> Figure:
+    """Expected return against processor minutes, evaluations included, one panel a task.
+
+    returns: `statistics.learning_curves`; minutes: `statistics.core_minutes` of the same runs.
+    """
+    timed = returns.merge(minutes, on=["task", "variant", "step"])
+    figure = style.new_figure(style.TEXT_WIDTH, 2.1)
+    axes = figure.subplots(1, len(tasks), squeeze=False)[0]
+    for ax, task in zip(axes, tasks, strict=True):
+        _task_panel(timed.drop(columns="step").rename(columns={"minutes": "step"}), task, ax)
+        ax.set_title(task)
+        ax.set_xlabel("core-minutes")
+    axes[0].set_ylabel(f"expected {name}")
+    _legend(figure, style.ordered(returns["variant"].unique()))
+    return figure
+
+
+@style.styled
 def sensitivity(
     returns: pd.DataFrame,
     costs: pd.DataFrame,

@@ -71,6 +71,23 @@ rule illustrations:
         "../scripts/illustrations.py"
 
 
+# Learning for the money: the same returns against processor time.
+rule compute_curves:
+    input:
+        progress=rules.aggregate.output.progress,
+        runs=rules.aggregate.output.runs,
+    output:
+        **figure_outputs("compute_curves"),
+    log:
+        f"{LOGS}/compute_curves.log",
+    threads: 1
+    params:
+        **GRID,
+        **BUDGET,
+    script:
+        "../scripts/compute_curves.py"
+
+
 rule final_scores:
     input:
         scores=rules.aggregate.output.scores,
@@ -150,7 +167,11 @@ rule policies:
         "../scripts/policies.py"
 
 
-TARGETS += [*rules.illustrations.output, *rules.final_scores.output]
+TARGETS += [
+    *rules.illustrations.output,
+    *rules.compute_curves.output,
+    *rules.final_scores.output,
+]
 if LEARNED:
     TARGETS += [*rules.parameters.output]
 if LEARNED and ROBOT_TASKS:
