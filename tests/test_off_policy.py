@@ -210,6 +210,8 @@ def test_certificate_travel_bounds_the_distance_whatever_the_budget():
         batch = Batch(*(field.float() for field in transitions()))
         for agent.updates in range(1, updates + 1):
             agent.update_certificate(batch)
+            moved = joint_sis.travelled(agent.config, agent.updates, updates)
+            assert 1.0 - agent.zeta[1].item() == pytest.approx(moved, abs=0.015)
         assert agent.zeta[1].item() == pytest.approx(1.0 - 0.2, abs=0.015)
 
 

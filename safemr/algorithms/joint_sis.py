@@ -83,6 +83,14 @@ def certificate_loss(
     return (multipliers * fac.constraint_values(batch, zeta, d_min, config)).mean()
 
 
+def travelled(config: Config, updates: float, total_updates: int) -> float:
+    """Sum of zeta's learning rates over the first ``updates`` of ``total_updates`` gradient steps:
+    how far a gradient of 1 would have moved it. `certificate_travel` at the end of the run."""
+    first = int(config.certificate_start * total_updates)
+    share = min(max((updates - first) / (total_updates - first), 0.0), 1.0)
+    return config.certificate_travel * (1.0 - (1.0 - share) ** 2)
+
+
 class Agent(fac.Agent):
     """Feasible actor-critic whose zeta descends `certificate_loss`."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import matplotlib
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -164,6 +165,45 @@ def parameter_evolution(
         for ax in row if index < len(tasks) - 1 else ():
             ax.set_xlabel("")
     _legend(figure, [*variants, *(fixed or {})])
+    return figure
+
+
+@style.styled
+def certificate_paths(
+    progress: pd.DataFrame,
+    travelled: pd.DataFrame,
+    *,
+    groups: Mapping[str, Sequence[str]],
+) -> Figure:
+    """zeta against the sum of its learning rates so far; one row a group of variants.
+
+    progress: tidy table of one task; travelled: variant, step, travel. Where zeta only drifts the
+    paths of different rates lie on each other; where it has settled they are level.
+    """
+    names = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
+    figure = style.new_figure(style.TEXT_WIDTH, 0.3 + 1.55 * len(groups))
+    axes = figure.subplots(len(groups), 3, squeeze=False)
+    for row, (group, variants) in zip(axes, groups.items(), strict=True):
+        shades = matplotlib.colormaps["viridis"].resampled(len(variants) + 1)
+        for index, variant in enumerate(variants):
+            path = travelled[travelled["variant"] == variant][["step", "travel"]]
+            for ax, metric in zip(row, names, strict=True):
+                chosen = progress[(progress["variant"] == variant) & (progress["metric"] == metric)]
+                mean = chosen.groupby("step")["value"].mean().reset_index().merge(path, on="step")
+                line = ("-", (0, (4, 1.5)), (0, (1, 1.2)))[index % 3]
+                label = variant.removeprefix(group).lstrip("-") or "default"
+                ax.plot(mean["travel"], mean["value"], color=shades(index), ls=line, label=label)
+                ax.plot(*mean[["travel", "value"]].iloc[-1], ".", color=shades(index), ms=4)
+        for ax, symbol in zip(row, names.values(), strict=True):
+            ax.set_xscale("symlog", linthresh=0.1)
+            ax.set_xlim(left=0)
+            ax.set_xticks([0, 0.1, 0.33, 1, 3.3], ["0", "0.1", "0.33", "1", "3.3"])
+            ax.set_xticks([], minor=True)
+            ax.set_ylabel(symbol, rotation=0, labelpad=6)
+        row[0].set_title(group, loc="left")
+        row[2].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    for ax in axes[-1]:
+        ax.set_xlabel("sum of learning rates")
     return figure
 
 

@@ -121,6 +121,27 @@ rule parameters:
         "../scripts/parameters.py"
 
 
+# Made on demand (docs/tuning.md): the learned parameters against what moved them.
+rule certificate_paths:
+    input:
+        progress=rules.aggregate.output.progress,
+    output:
+        **figure_outputs("certificate_paths"),
+    log:
+        f"{LOGS}/certificate_paths.log",
+    threads: 1
+    params:
+        **BUDGET,
+        task=GRID["tasks"][0] if GRID["tasks"] else "",
+        algorithms={
+            run.variant: {**run.config["algorithm"], "steps": run.config["steps"]}
+            for run in PLAN.navigation
+            if run.variant in LEARNED and run.task == CONFIG.tasks[0]
+        },
+    script:
+        "../scripts/certificate_paths.py"
+
+
 # What drawings need of the trained policies. policy.npz is optional in a record and hence no input:
 # which ones are missing is written down beside the figures that lack them.
 rule rollouts:

@@ -1,0 +1,31 @@
+"""zeta against the sum of its learning rates: does it settle, or only drift?"""
+
+from pathlib import Path
+
+import pandas as pd
+
+from safemr import runs
+from safemr.algorithms import joint_sis
+from safemr.plotting import curves, style
+
+params = snakemake.params
+progress = pd.read_csv(snakemake.input.progress)
+progress = progress[progress["task"] == params.task]
+rows = []
+for variant, described in params.algorithms.items():
+    algorithm = runs.load_algorithm(described["name"])
+    config = algorithm.hyperparameters(**described["hyperparameters"])
+    log = progress[(progress["variant"] == variant) & (progress["metric"] == "updates")]
+    total = (described["steps"] - config.start_steps) // config.update_every
+    for step, updates in log.groupby("step")["value"].mean().items():
+        rows.append((variant, step, joint_sis.travelled(config, updates, total)))
+travelled = pd.DataFrame(rows, columns=["variant", "step", "travel"])
+names = {"safemr": "SafeMR", "joint_sis": "JointSIS"}
+groups = {
+    title: [v for v, described in params.algorithms.items() if described["name"] == name]
+    for name, title in names.items()
+}
+figure = curves.certificate_paths(
+    progress, travelled, groups={title: members for title, members in groups.items() if members}
+)
+style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))
