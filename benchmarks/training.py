@@ -22,7 +22,7 @@ import importlib
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -166,13 +166,22 @@ def flop(product: Product) -> float:
 class Run:
     """A trainer in the middle of a run, and its stopwatch."""
 
-    def __init__(self, algorithm: str, task: str, held: int, backend: str | None) -> None:
+    def __init__(
+        self,
+        algorithm: str,
+        task: str,
+        held: int,
+        backend: str | None,
+        hyperparameters: Mapping[str, Any] | None = None,
+        task_settings: Mapping[str, Any] | None = None,
+    ) -> None:
         module = importlib.import_module(f"safemr.algorithms.{algorithm}")
         settings: dict[str, Any] = {"backend": backend, "start_steps": 512} if backend else {}
         if hasattr(module.Config, "certificate_start"):
             settings["certificate_start"] = 0.0
-        config = module.Config(**settings)
-        environments = functools.partial(make_envs, {"name": task, "settings": {}})
+        config = module.Config(**settings | dict(hyperparameters or {}))
+        described = {"name": task, "settings": dict(task_settings or {})}
+        environments = functools.partial(make_envs, described)
         self.trainer = module.Trainer(config, environments, 100, 10**7)
         self.algorithm, self.backend = algorithm, backend
         # One block: enough for every kind of update, a whole epoch where there are epochs.
