@@ -1,5 +1,4 @@
-# After a SIGKILL or a power failure the next `snakemake` just continues, and beside a live one it
-# waits until that is done. No rules.
+# After a SIGKILL or a power failure the next `snakemake` just continues. No rules.
 #
 # Snakemake leaves two things behind when it is killed: its lock, which nothing but a person would
 # remove, and markers of outputs that were being written, which stop the next start. Both are
@@ -9,8 +8,6 @@ import base64
 import fcntl
 import shutil
 from pathlib import Path
-
-from safemr.locks import ProcessLock
 
 IS_RECORD = re.compile(r"seed\d+-[0-9a-f]{12}").fullmatch
 
@@ -49,22 +46,5 @@ def recover(state):
     return alive
 
 
-# One Snakemake at a time makes the files under a results root, from whatever folder it was started:
-# Snakemake's own lock is looked up and written in two steps, and invites to be removed by hand.
-if workflow.is_main_process and not workflow.output_settings.dryrun:
-    ROOT_LOCK = ProcessLock(
-        Path(RESULTS, ".work", "snakemake.lock"), f"makes the files under {RESULTS}"
-    )
-    ROOT_LOCK.acquire(wait=True)
-
 if workflow.is_main_process:
     ALIVE = recover(Path(".snakemake"))
-
-# What tables and figures are made of: everything, or with allow_missing what is there already.
-RECORDED = [
-    run
-    for run in PLAN.runs
-    if not CONFIG.allow_missing or os.path.exists(f"{RESULTS}/{run.path}/provenance.json")
-]
-if not RECORDED:
-    sys.exit("error: allow_missing is set, but none of the configured runs is recorded yet")
