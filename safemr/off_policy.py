@@ -52,7 +52,7 @@ class Trainer:
             n_step=config.n_step,
             device=config.device,
         )
-        self._sampling = generator(seed, 2, config.device)
+        self._sampling = generator(seed, 2)  # rows are drawn on the CPU and looked up on the device
         self._random_actions = generator(seed, 3)
         self._held = torch.zeros(config.num_envs, action_dim)
         self._episodes = EpisodeStatistics(config.num_envs)
@@ -104,6 +104,7 @@ class Trainer:
             action = self._held
         else:
             action = self.agent.act(torch.from_numpy(self._observations).to(device)).cpu()
+            check_finite(self.step, {"action": float(action.sum())})
         raw, rewards, terminated, truncated, infos = self.envs.step(action.numpy())
         observations, features = self.transform(raw), self._energy_features(infos)
         reached, reached_features = observations, features

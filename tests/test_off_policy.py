@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import copy
 import math
 
 import numpy as np
@@ -17,6 +18,7 @@ from safemr.evaluate import evaluate
 from safemr.training import TrainingDivergedError
 
 MODULES = (fac, joint_sis, safemr)
+DEVICES = ("cpu", *(("cuda",) if torch.cuda.is_available() else ()))
 SMALL = {
     "num_envs": 4,
     "hidden": 16,
@@ -142,6 +144,23 @@ def test_same_seed_same_numbers_and_other_seed_other_numbers(module):
     np.testing.assert_equal(rows[0], rows[1])
     assert rows[0]["critic_loss"] != rows[2]["critic_loss"]
     assert torch.equal(first.agent.critics.parameters, second.agent.critics.parameters)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_every_device_of_this_machine_trains_and_resumes(device):
+    trainer = make(safemr, device=device, backend="torch")
+    trainer.advance(600)
+    assert trainer.agent.critics.parameters.device.type == device
+    state = copy.deepcopy(trainer.state_dict())
+    trainer.advance(1200)
+    resumed = make(safemr, device=device, backend="torch")
+    resumed.load_state_dict(state)
+    resumed.advance(1200)
+    for name in ("critics", "policy", "multiplier"):
+        one, other = (getattr(t.agent, name).parameters.detach() for t in (trainer, resumed))
+        assert torch.equal(one, other)
+        assert torch.isfinite(one).all()
+    assert trainer.policy.arrays()["policy_parameters"].dtype == np.float32
 
 
 @pytest.mark.parametrize("module", MODULES)
