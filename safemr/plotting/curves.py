@@ -61,13 +61,18 @@ def training_curves(
     """Fig. "major": expected return above, expected cost below, one column a task, one legend.
 
     returns, costs: `statistics.learning_curves` of the same runs. A task without runs keeps its
-    panels, which then say so.
+    panels, which then say so. Where budgets differ by more than a factor of two the steps are
+    logarithmic, so that the shorter curves are not squeezed into a corner.
     """
     figure = style.new_figure(style.TEXT_WIDTH, 3.3)
     axes = figure.subplots(2, len(tasks), sharex="col", squeeze=False)
     for column, task in enumerate(tasks):
         for ax, table in zip(axes[:, column], (returns, costs), strict=True):
             _task_panel(table, task, ax)
+        ends = returns[returns["task"] == task].groupby("variant")["step"].agg(["min", "max"])
+        if ends["max"].max() > 2 * ends["max"].min():
+            axes[0, column].set_xscale("log")
+            axes[0, column].set_xlim(ends["min"].min(), ends["max"].max())
         axes[0, column].set_title(task)
         cost_axis(axes[1, column])
         style.thousands(axes[1, column])

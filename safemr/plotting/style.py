@@ -11,7 +11,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 COLUMN_WIDTH = 3.5  # inches, one column of the paper
 TEXT_WIDTH = 7.16  # inches, both columns
@@ -111,6 +111,7 @@ def thousands(ax: Axes) -> None:
     million = ax.get_xlim()[1] >= 2e6
     unit, name = (1e6, r"$10^6$") if million else (1e3, r"$10^3$")
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / unit:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel(f"environment steps ({name})")
 
 
