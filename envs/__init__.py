@@ -2,7 +2,8 @@
 
 Navigation: `Pillars-0.15-Goal-v0`, `Pillars-0.30-Goal-v0`, `Hazards-0.15-Push-v0` and
 `Hazards-0.30-Push-v0`, for `gymnasium.make` and for `gymnasium.make_vec` with
-`vectorization_mode="vector_entry_point"`. See docs/environments.md.
+`vectorization_mode="vector_entry_point"`. `PointGoal1-v0`, in the same ways, is Safety Gym's, for
+comparison with published results. See docs/environments.md.
 
 Two aircraft: `Aircraft-v0`. See docs/aircraft.md.
 """
@@ -11,9 +12,9 @@ from __future__ import annotations
 
 import gymnasium
 
-from envs.tasks import NAVIGATION_TASKS
+from envs.tasks import REGISTERED_TASKS
 
-for _task in NAVIGATION_TASKS.values():
+for _task in REGISTERED_TASKS.values():
     gymnasium.register(
         id=f"{_task.name}-v0",
         entry_point="envs.navigation:NavigationEnv",

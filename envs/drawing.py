@@ -19,12 +19,14 @@ GOAL_COLOR = "#2ca02c"
 BOX_COLOR = "#cc9a1f"
 NOSE = 0.15  # m, how far the arrow reaches ahead
 BOX_HALF, COLUMN_OFFSET, COLUMN_HALF = 0.2, 0.2, 0.1  # m, as in assets/hazards_push.xml
+VASE_HALF = 0.1  # m, as in assets/hazards_goal.xml
+SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def draw_scene(
     ax: Axes, scene: Scene, trajectory: NDArray[np.float64] | None = None, margin: float = 0.3
 ) -> Axes:
-    """Draw robot with heading, goal, obstacles, box and, if given, a trajectory [T, 2] on `ax`.
+    """Draw robot with heading, goal, obstacles, box or vase and, if given, a trajectory [T, 2].
 
     The dotted circles around pillars are d_min, which the robot's centre must not enter. Axes are
     in metres; the view is the square that layouts are drawn from, widened to the trajectory.
@@ -48,9 +50,11 @@ def draw_scene(
             ax.add_patch(
                 Circle(_point(xy), task.d_min, fill=False, ec=OBSTACLE_COLOR, ls=":", zorder=2)
             )
-    if scene.box is not None:
-        for corners in _box_outlines(scene.box):
-            ax.add_patch(Polygon(corners, closed=True, fc=BOX_COLOR, ec="none", zorder=4))
+    outlines = [] if scene.box is None else _box_outlines(scene.box)
+    if scene.vase is not None:
+        outlines.append(_placed(VASE_HALF * SQUARE, scene.vase))
+    for corners in outlines:
+        ax.add_patch(Polygon(corners, closed=True, fc=BOX_COLOR, ec="none", zorder=4))
     position, heading = scene.robot[:2], scene.robot[2]
     ax.add_patch(Circle(_point(position), ROBOT_RADIUS, fc=ROBOT_COLOR, ec="none", zorder=5))
     nose = _rotated(np.array([[0.0, -0.05], [NOSE, -0.05], [NOSE, 0.05], [0.0, 0.05]]), heading)
@@ -66,9 +70,12 @@ def draw_scene(
 
 
 def _box_outlines(box: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    parts = [BOX_HALF * square] + [COLUMN_HALF * square + COLUMN_OFFSET * c for c in square]
-    return [_rotated(part, box[2]) + box[:2] for part in parts]
+    parts = [BOX_HALF * SQUARE] + [COLUMN_HALF * SQUARE + COLUMN_OFFSET * c for c in SQUARE]
+    return [_placed(part, box) for part in parts]
+
+
+def _placed(points: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _rotated(points, pose[2]) + pose[:2]
 
 
 def _point(xy: NDArray[np.float64]) -> tuple[float, float]:

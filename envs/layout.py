@@ -34,19 +34,20 @@ class Layout:
     goal: Array  # [2]
     obstacles: Array  # [M, 2]
     obstacle_yaws: Array  # [M]
-    box: Array | None  # [3] x, y, yaw
+    box: Array | None  # [3] x, y, yaw of the box or the vase
 
 
 def sample_layout(task: NavigationTask, rng: np.random.Generator) -> Layout:
     """A layout with at least the sum of two keepouts between any two objects.
 
-    Objects are placed in the order robot, goal, box, obstacles, each with up to 100 draws; if one
-    finds no room, all start again. The goal is then drawn anew against the others, as Safety Gym
-    does: that second goal is the one in force. Raises LayoutError after 10,000 attempts.
+    Objects are placed in the order robot, goal, box, obstacles, vase, each with up to 100 draws; if
+    one finds no room, all start again. The goal is then drawn anew against the others, as Safety
+    Gym does: that second goal is the one in force. Raises LayoutError after 10,000 attempts.
     """
     keepouts = [task.robot_keepout, task.goal_keepout]
     keepouts += [task.box_keepout] * task.has_box
     keepouts += [task.obstacle_keepout] * task.num_obstacles
+    keepouts += [task.box_keepout] * task.has_vase
     for _ in range(LAYOUT_ATTEMPTS):
         placed: list[Disc] = []
         for keepout in keepouts:
@@ -63,13 +64,14 @@ def sample_layout(task: NavigationTask, rng: np.random.Generator) -> Layout:
     goal = sample_goal(task, rng, placed[:1] + placed[2:])
     if goal is None:
         raise LayoutError(_impossible(task, f"no goal was found in {GOAL_DRAWS} draws"))
-    first_obstacle = 2 + task.has_box
+    first, free = 2 + task.has_box, 2 if task.has_box else -1
+    obstacles = slice(first, first + task.num_obstacles)
     return Layout(
         robot=np.append(positions[0], yaws[0]),
         goal=goal,
-        obstacles=np.array(positions[first_obstacle:]),
-        obstacle_yaws=yaws[first_obstacle:],
-        box=np.append(positions[2], yaws[2]) if task.has_box else None,
+        obstacles=np.array(positions[obstacles]),
+        obstacle_yaws=yaws[obstacles],
+        box=np.append(positions[free], yaws[free]) if task.has_free_body else None,
     )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from envs.navigation_batch import NavigationBatch, Scene
 from envs.rendering import FrameRenderer
-from envs.tasks import NAVIGATION_TASKS, NavigationTask
+from envs.tasks import REGISTERED_TASKS, NavigationTask
 
 Array = NDArray[np.float64]
 
@@ -28,9 +28,9 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 
 def find_task(name: str, settings: Mapping[str, Any]) -> NavigationTask:
     """The task of this name with some settings changed. Raises ValueError for unknown ones."""
-    if name not in NAVIGATION_TASKS:
-        raise ValueError(f"unknown task {name!r}; tasks: {', '.join(NAVIGATION_TASKS)}")
-    return NAVIGATION_TASKS[name].with_settings(**settings)
+    if name not in REGISTERED_TASKS:
+        raise ValueError(f"unknown task {name!r}; tasks: {', '.join(REGISTERED_TASKS)}")
+    return REGISTERED_TASKS[name].with_settings(**settings)
 
 
 def observation_space(task: NavigationTask) -> Box:

@@ -32,6 +32,7 @@ class Scene:
     goal: Array  # [2]
     obstacles: Array  # [M, 2]
     box: Array | None  # [3] x, y, yaw
+    vase: Array | None  # [3] x, y, yaw
 
 
 class NavigationBatch:
@@ -78,6 +79,7 @@ class NavigationBatch:
             self.task.has_box,
             self.task.goal_size,
             self._hazard_size,
+            self.task.indicator_cost,
             self.worlds.d,
             self.worlds.contacts,
             diverged,
@@ -109,6 +111,7 @@ class NavigationBatch:
             worlds.obstacles,
             worlds.goal,
             self._blocks,
+            self.task.lidar_range,
             observation,
         )
         return observation
@@ -122,16 +125,17 @@ class NavigationBatch:
     def scene(self, index: int) -> Scene:
         """A copy of what can be drawn of one world."""
         worlds = self.worlds
-        box = None
-        if self.task.has_box:
+        free = None
+        if self.task.has_free_body:
             x, y, _, w, i, j, k = worlds.qpos[index, 3:10]
-            box = np.array([x, y, np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))])
+            free = np.array([x, y, np.arctan2(2 * (w * k + i * j), 1 - 2 * (j * j + k * k))])
         return Scene(
             task=self.task,
             robot=worlds.pose[index].copy(),
             goal=worlds.goal[index].copy(),
             obstacles=worlds.obstacles[index].copy(),
-            box=box,
+            box=free if self.task.has_box else None,
+            vase=free if self.task.has_vase else None,
         )
 
     def get_state(self) -> dict[str, Any]:
@@ -173,7 +177,7 @@ class NavigationBatch:
     def _resample_goal(self, index: int) -> bool:
         task, worlds = self.task, self.worlds
         others = [(worlds.pose[index, :2], task.robot_keepout)]
-        if task.has_box:
+        if task.has_free_body:
             others.append((worlds.qpos[index, 3:5], task.box_keepout))
         others += [(xy, task.obstacle_keepout) for xy in worlds.obstacles[index]]
         goal = sample_goal(task, self.generators[index], others)

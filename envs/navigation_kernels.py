@@ -141,11 +141,24 @@ def task_distances(pose, qpos, goal, has_box, distances):
 
 
 @numba.njit(cache=True)
-def score(before, after, has_box, goal_size, hazard_size, d, contacts, diverged, scores, goal_met):
+def score(
+    before,
+    after,
+    has_box,
+    goal_size,
+    hazard_size,
+    indicator_cost,
+    d,
+    contacts,
+    diverged,
+    scores,
+    goal_met,
+):
     """Rewards and costs of one step, SCORES [7, N] and goal_met [N], from the task's distances.
 
     Cost: pillars (hazard_size 0): contacts of the robot's sphere, contacts[:, 0]; hazards: depth
-    inside, summed. The contact count is Safety Gym's, with the arrow, contacts[:, 1].
+    inside, summed, or with indicator_cost whether inside any. The contact count is Safety Gym's,
+    with the arrow, contacts[:, 1].
     """
     for i in range(before.shape[0]):
         if diverged[i]:
@@ -162,6 +175,8 @@ def score(before, after, has_box, goal_size, hazard_size, d, contacts, diverged,
             for j in range(d.shape[1]):
                 cost += max(hazard_size - d[i, j], 0.0)
             contact = 1.0 if cost > 0.0 else 0.0
+            if indicator_cost:
+                cost = contact
         scores[0, i] = approach + push + goal
         scores[1, i] = approach
         scores[2, i] = push
@@ -172,14 +187,21 @@ def score(before, after, has_box, goal_size, hazard_size, d, contacts, diverged,
 
 
 @numba.njit(cache=True)
-def _add_to_lidar(bins, pose, c, s, x, y):
-    """Safety Gym's pseudo lidar for one point: exp(-distance) into its bin and, aliased, beside."""
+def _add_to_lidar(bins, pose, c, s, x, y, lidar_range):
+    """Safety Gym's pseudo lidar for one point: its signal into its bin and, aliased, beside.
+
+    The signal is exp(-distance), or with a finite range 1 - distance / range, at least 0.
+    """
     dx, dy = x - pose[0], y - pose[1]
     angle = math.atan2(c * dy - s * dx, c * dx + s * dy) % (2 * math.pi)
     position = angle / BIN_WIDTH
     fraction = position - math.floor(position)
     index = int(position) % LIDAR_BINS
-    signal = math.exp(-math.sqrt(dx * dx + dy * dy))
+    distance = math.sqrt(dx * dx + dy * dy)
+    if lidar_range < math.inf:
+        signal = max(0.0, lidar_range - distance) / lidar_range
+    else:
+        signal = math.exp(-distance)
     after, before = (index + 1) % LIDAR_BINS, (index - 1) % LIDAR_BINS
     bins[index] = max(bins[index], signal)
     bins[after] = max(bins[after], fraction * signal)
@@ -187,11 +209,11 @@ def _add_to_lidar(bins, pose, c, s, x, y):
 
 
 @numba.njit(cache=True)
-def observe(pose, qpos, qvel, qacc, obstacles, goal, blocks, observation):
+def observe(pose, qpos, qvel, qacc, obstacles, goal, blocks, lidar_range, observation):
     """The flat observation [N, obs] (zeros on entry), in closed form from the state.
 
     blocks: first columns of accelerometer, gyro, magnetometer, velocimeter, goal lidar, obstacle
-    lidar, box lidar (-1: no box). Sensors are in the body frame at the body origin.
+    lidar, lidar of box or vase (-1: neither). Sensors are in the body frame at the body origin.
     """
     for i in range(pose.shape[0]):
         out = observation[i]
@@ -206,18 +228,19 @@ def observe(pose, qpos, qvel, qacc, obstacles, goal, blocks, observation):
         out[blocks[2]] = -MAGNETIC_FIELD * s
         out[blocks[2] + 1] = -MAGNETIC_FIELD * c
         bins = out[blocks[4] : blocks[4] + LIDAR_BINS]
-        _add_to_lidar(bins, pose[i], c, s, goal[i, 0], goal[i, 1])
+        _add_to_lidar(bins, pose[i], c, s, goal[i, 0], goal[i, 1], lidar_range)
         bins = out[blocks[5] : blocks[5] + LIDAR_BINS]
         for j in range(obstacles.shape[1]):
-            _add_to_lidar(bins, pose[i], c, s, obstacles[i, j, 0], obstacles[i, j, 1])
+            x, y = obstacles[i, j, 0], obstacles[i, j, 1]
+            _add_to_lidar(bins, pose[i], c, s, x, y, lidar_range)
         if blocks[6] >= 0:
             bins = out[blocks[6] : blocks[6] + LIDAR_BINS]
-            _add_to_lidar(bins, pose[i], c, s, qpos[i, 3], qpos[i, 4])
+            _add_to_lidar(bins, pose[i], c, s, qpos[i, 3], qpos[i, 4], lidar_range)
 
 
 def observation_blocks(layout: dict[str, slice]) -> np.ndarray:
     """The `blocks` argument of `observe` for an observation layout."""
     obstacles = next(name for name in ("pillars_lidar", "hazards_lidar") if name in layout)
     names = ("accelerometer", "gyro", "magnetometer", "velocimeter", "goal_lidar", obstacles)
-    starts = [layout[name].start for name in names]
-    return np.array([*starts, layout["box_lidar"].start if "box_lidar" in layout else -1])
+    free = [layout[name].start for name in ("box_lidar", "vase_lidar") if name in layout]
+    return np.array([*(layout[name].start for name in names), *(free or [-1])])

@@ -16,7 +16,6 @@ from envs.navigation_kernels import kinematics, read_states, write_controls
 from envs.tasks import NavigationTask
 
 FRAME_SKIP = 10  # MuJoCo steps of 0.002 s in one environment step
-BOX_HEIGHT = 0.2  # m, z of the box's centre at the start
 ROBOT_REACH = 0.16  # m, the corners of the nose are 0.158 m from the robot's origin
 
 Array = NDArray[np.float64]
@@ -110,7 +109,7 @@ class Worlds:
         mujoco.mj_resetData(self.models[index], data)
         if layout.box is not None:
             x, y, yaw = layout.box
-            data.qpos[3:10] = (x, y, BOX_HEIGHT, *_yaw_quaternion(yaw))
+            data.qpos[3:5], data.qpos[6:10] = (x, y), _yaw_quaternion(yaw)  # z: the MJCF's
         mujoco.mj_forward(self.models[index], data)
 
     def move_goal(self, index: int, goal: Array) -> None:

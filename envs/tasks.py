@@ -1,17 +1,25 @@
 """The navigation tasks: one frozen dataclass each, and nothing about them anywhere else.
 
-The four tasks are Safety Gym configurations of the point robot as the JointSIS code base uses
-them (`Safexp-CustomGoalPillar2-v0`, `Safexp-CustomPush1-v0`); the 0.30 tasks change the obstacle
-size only. See docs/environments.md.
+The four of the paper are Safety Gym configurations of the point robot as the JointSIS code base
+uses them (`Safexp-CustomGoalPillar2-v0`, `Safexp-CustomPush1-v0`); the 0.30 tasks change the
+obstacle size only. `PointGoal1` is Safety Gym's own `Safexp-PointGoal1-v0`, for comparing the
+baselines with published results and nothing else. See docs/environments.md.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 ROBOT_RADIUS = 0.1  # m, the sphere of assets/point.xml
 LIDAR_BINS = 16
+# `vases_lidar` is Safety Gym's lidar of vases that are not there, always zero.
+LIDARS = {
+    "pillars_goal": ("goal", "pillars"),
+    "hazards_push": ("goal", "box", "hazards", "vases"),
+    "hazards_goal": ("goal", "hazards", "vase"),
+}
 
 
 @dataclass(frozen=True)
@@ -19,17 +27,18 @@ class NavigationTask:
     """A point robot that reaches a goal, or pushes a box there, among circular obstacles.
 
     Lengths in metres. `pillars_goal`: solid pillars, reach the goal. `hazards_push`: flat zones
-    that can be crossed, push the box to the goal. Raises ValueError for values out of range.
+    that can be crossed, push the box to the goal. `hazards_goal`: flat zones and a light vase that
+    stands in the way, reach the goal. Raises ValueError for values out of range.
     """
 
     name: str
-    family: Literal["pillars_goal", "hazards_push"]  # also the name of the MJCF file
+    family: Literal["pillars_goal", "hazards_push", "hazards_goal"]  # names the MJCF file, too
     obstacle_size: float  # radius
     num_obstacles: int
     obstacle_keepout: float = 0.4  # keepouts: two objects start at least their sum apart
     robot_keepout: float = 0.4
     goal_keepout: float = 0.4
-    box_keepout: float = 0.2
+    box_keepout: float = 0.2  # of the box or the vase
     goal_size: float = 0.3  # the goal is met at this distance
     extent: float = 2.0  # objects start in the square [-extent, extent]^2
     max_episode_steps: int = 1000
@@ -58,8 +67,27 @@ class NavigationTask:
         return self.family == "hazards_push"
 
     @property
+    def has_vase(self) -> bool:
+        return self.family == "hazards_goal"
+
+    @property
+    def has_free_body(self) -> bool:
+        """Whether there is a box or a vase: a body that moves when it is pushed."""
+        return self.has_box or self.has_vase
+
+    @property
     def solid_obstacles(self) -> bool:
         return self.family == "pillars_goal"
+
+    @property
+    def indicator_cost(self) -> bool:
+        """Whether `cost` is 1 a violating step (Safety Gym's default) instead of the depth."""
+        return self.family == "hazards_goal"
+
+    @property
+    def lidar_range(self) -> float:
+        """The pseudo lidar's reading falls linearly to 0 at this distance; inf: exponentially."""
+        return 3.0 if self.family == "hazards_goal" else math.inf
 
     @property
     def d_min(self) -> float:
@@ -74,8 +102,7 @@ class NavigationTask:
     def observation_layout(self) -> dict[str, slice]:
         """Sensor block -> slice of the flat observation, blocks in alphabetical order."""
         sizes = {"accelerometer": 3, "gyro": 3, "magnetometer": 3, "velocimeter": 3}
-        lidars = ["goal", "box", "hazards", "vases"] if self.has_box else ["goal", "pillars"]
-        sizes |= {f"{name}_lidar": LIDAR_BINS for name in lidars}
+        sizes |= {f"{name}_lidar": LIDAR_BINS for name in LIDARS[self.family]}
         layout, start = {}, 0
         for name in sorted(sizes):
             layout[name] = slice(start, start + sizes[name])
@@ -105,3 +132,16 @@ NAVIGATION_TASKS = {
     task.name: task
     for task in (_pillars_goal(0.15), _pillars_goal(0.30), _hazards_push(0.15), _hazards_push(0.30))
 }
+
+POINT_GOAL = NavigationTask(
+    "PointGoal1",
+    "hazards_goal",
+    obstacle_size=0.2,
+    num_obstacles=8,
+    obstacle_keepout=0.18,
+    goal_keepout=0.305,
+    box_keepout=0.15,
+    extent=1.5,
+)
+
+REGISTERED_TASKS = NAVIGATION_TASKS | {POINT_GOAL.name: POINT_GOAL}

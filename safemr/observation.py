@@ -23,7 +23,8 @@ class Block:
 
 
 # The point robot moves in the plane, so vertical acceleration (always g), vertical velocity and the
-# rates about x and y carry nothing; nor does the lidar of vases, of which these tasks have none.
+# rates about x and y carry nothing; nor does `vases_lidar`, since the tasks that have it have no
+# vases (the vase of PointGoal1 is seen by `vase_lidar`).
 # Contacts and the yaw servo throw the accelerometer and the gyro far outside their usual range.
 BLOCKS: Mapping[str, Block] = {
     "accelerometer": Block((0, 1), 0.1, 1.0),

@@ -24,7 +24,7 @@ import envs  # noqa: F401  (registers the tasks)
 from envs.drawing import draw_scene
 from envs.navigation_kernels import observation_blocks, observe
 from envs.navigation_physics import Worlds, compile_model
-from envs.tasks import NAVIGATION_TASKS
+from envs.tasks import NAVIGATION_TASKS, REGISTERED_TASKS
 
 TASKS = sorted(NAVIGATION_TASKS)
 TIME_STEP = 0.02  # s, one environment step
@@ -83,7 +83,7 @@ def test_solver_and_collision_options_are_mujocos_defaults(sleep: bool) -> None:
     assert options.enableflags == (mujoco.mjtEnableBit.mjENBL_SLEEP if sleep else 0)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", sorted(REGISTERED_TASKS))
 def test_the_stepping_order_is_bitwise_ten_mujoco_steps(name: str) -> None:
     env = gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped
     env.reset(seed=2)
@@ -218,7 +218,8 @@ def test_observation_by_definition(seed: int, name: str) -> None:
     pose, goal = rng.normal(0, 2, (1, 3)), rng.normal(0, 2, (1, 2))
     obstacles = rng.normal(0, 2, (1, task.num_obstacles, 2))
     observation = np.zeros((1, max(block.stop for block in layout.values())))
-    observe(pose, qpos, qvel, qacc, obstacles, goal, observation_blocks(layout), observation)
+    blocks, reach = observation_blocks(layout), task.lidar_range
+    observe(pose, qpos, qvel, qacc, obstacles, goal, blocks, reach, observation)
     c, s = np.cos(qpos[0, 2]), np.sin(qpos[0, 2])
     to_body = np.array([[c, s], [-s, c]])
     lidars = {"goal_lidar": goal, "pillars_lidar": obstacles[0], "hazards_lidar": obstacles[0]}
@@ -234,7 +235,7 @@ def test_observation_by_definition(seed: int, name: str) -> None:
         np.testing.assert_allclose(observation[0, columns], expected[block], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", sorted(REGISTERED_TASKS))
 def test_top_down_drawing(name: str) -> None:
     env = gymnasium.make(f"{name}-v0").unwrapped
     env.reset(seed=0)
@@ -248,7 +249,7 @@ def test_top_down_drawing(name: str) -> None:
     expected |= {(*np.round(xy, 6), env.task.obstacle_size) for xy in scene.obstacles}
     assert expected <= drawn
     polygons = [p for p in ax.patches if isinstance(p, matplotlib.patches.Polygon)]
-    assert len(polygons) == (6 if env.task.has_box else 1)
+    assert len(polygons) == (6 if env.task.has_box else 1 + env.task.has_vase)
     assert any(np.array_equal(line.get_xydata(), path) for line in ax.lines)
     assert ax.get_xlim()[1] >= path[:, 0].max()
     plt.close(ax.figure)

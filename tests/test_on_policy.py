@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import io
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,13 @@ from toy import ToyEnvs, optimal_return
 
 from safemr.algorithms import cpo, ppo_lagrangian
 from safemr.algorithms.ppo_lagrangian import clipped_surrogate, policy_loss
+from safemr.config import load
 from safemr.errors import UserError
 from safemr.evaluate import evaluate
 from safemr.on_policy import Batch, explained_variance
 from safemr.policies import Policy
 from safemr.rollout import Rollout, gae, minibatches
+from safemr.runs import resolve
 
 ALGORITHMS = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
 TOY: dict[str, Any] = {
@@ -294,6 +297,9 @@ def test_published_settings_are_valid(name):
     assert (config.hidden, config.epoch_steps, config.value_passes) == (256, 8_000, 80)
     assert config.value_batch >= config.epoch_steps
     assert module.Config() != config
+    runs = resolve(load(["config/config.yaml", "config/published.yaml"])).runs
+    (run,) = (run for run in runs if run.config["algorithm"]["name"] == name)
+    assert run.config["algorithm"]["hyperparameters"] == asdict(config)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,11 @@ in the configuration are all of it.
 | policy loss E[alpha log pi - min_j Q_j + lambda Q_c] | `fac.policy_loss` |
 | dual ascent on lambda E[Q_c(s, pi(s))] | `Agent.multiplier_inputs`, `fac.multiplier_loss` |
 
+Q_c is learned by one-step temporal differences: `Batch.costs` holds the cost of a transition's
+first step, which belongs to `Batch.discounts` and `Batch.bootstraps` only where these are one step
+ahead, too. Hence n_step = 1, and any other value is refused. Q_c has a target network, no entropy
+term, and is bootstrapped through truncation but not through termination.
+
 Differences from the paper: the discounted cost of the current policy is taken at states of the
 replay memory instead of starting states, as usual off-policy; the constraint critic is not doubled.
 The limit is a rate (cost a step), so that it needs no conversion between episode and discount.

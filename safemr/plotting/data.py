@@ -27,6 +27,7 @@ def scene_at(data: Arrays, episode: int, step: int) -> SimpleNamespace:
         goal=data["goal"][step, episode],
         obstacles=data["obstacles"][episode],
         box=None if np.isnan(box).any() else box,
+        vase=None,  # none in the tasks that are recorded
     )
 
 
