@@ -300,10 +300,45 @@ def best_safe_baseline(
     return best, returns
 
 
-def minutes(runs: pd.DataFrame) -> pd.DataFrame:
-    """Score rows (task, variant, seed, metric "minutes", value) from the runs' wall_s."""
-    rows = runs[["task", "variant", "seed"]].assign(metric="minutes", value=runs["wall_s"] / 60)
-    return rows.dropna(subset=["value"])
+def compute(runs: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
+    """What the runs cost: processor time, speed and memory of each variant on each task.
+
+    runs: the runs table (task, variant, seed, steps, cpu_s, wall_s, peak_rss_mb, cpu).
+    """
+    rows = []
+    for task, variant in _entries(runs, None):
+        chosen = runs[(runs["task"] == task) & (runs["variant"] == variant)]
+        core_s = float(chosen["cpu_s"].sum())
+        rows.append(
+            {
+                "task": task,
+                "variant": variant,
+                "runs": len(chosen),
+                "steps": int(chosen["steps"].iloc[0]),
+                "core_minutes": core_s / 60 / len(chosen),
+                "steps_per_core_s": chosen["steps"].sum() / core_s,
+                "peak_mb": float(chosen["peak_rss_mb"].max()),
+                "core_hours": core_s / 3600,
+            }
+        )
+    data = pd.DataFrame(rows)
+    display = pd.DataFrame(
+        {
+            "task": data["task"],
+            "algorithm": data["variant"],
+            "runs": data["runs"],
+            "steps a run": data["steps"].map("{:,}".format),
+            "core-minutes a run": data["core_minutes"].map("{:.1f}".format),
+            "steps a core-second": data["steps_per_core_s"].map("{:,.0f}".format),
+            "peak MB": data["peak_mb"].map("{:.0f}".format),
+        }
+    )
+    hours, processors = data["core_hours"].sum(), ", ".join(sorted(set(runs["cpu"].dropna())))
+    caption = (
+        f"Compute of the {len(runs)} recorded runs: {hours:.1f} core-hours in all, one thread a "
+        f"run, evaluations included ({processors})."
+    )
+    return Table("compute", caption, data, display, _notes(missing, None, None))
 
 
 def describe_missing(missing: pd.DataFrame) -> str:

@@ -57,6 +57,23 @@ def cells(table: tables.Table) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
+def test_compute_adds_up_the_processor_time():
+    runs = pd.DataFrame(
+        {"task": TASK, "variant": ["SafeMR", "SafeMR", "CPO"], "seed": [0, 1, 0],
+         "steps": [400_000, 400_000, 2_000_000], "cpu_s": [100.0, 140.0, 400.0],
+         "wall_s": [110.0, 300.0, 420.0], "peak_rss_mb": [500.0, 510.0, 400.0], "cpu": "a"}
+    )  # fmt: skip
+    table = tables.compute(runs)
+    header, _, *rows = cells(table)
+    assert [dict(zip(header, row, strict=True))["core-minutes a run"] for row in rows] == [
+        "2.0",
+        "6.7",
+    ]
+    assert rows[0][2:] == ["2", "400,000", "2.0", "3,333", "510"]
+    assert table.data["core_hours"].sum() == pytest.approx(640 / 3600)
+    assert "0.2 core-hours" in table.caption
+
+
 # --- tables --------------------------------------------------------------------------------------
 
 

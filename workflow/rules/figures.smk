@@ -1,6 +1,10 @@
 # Tables and figures of the navigation grid.
 GRID = {"tasks": list(CONFIG.tasks), "variants": [*CONFIG.algorithms, *CONFIG.outside]}
-TABLES = {"table1": "../report/table_1.rst", "results": "../report/results.rst"}
+TABLES = {
+    "table1": "../report/table_1.rst",
+    "results": "../report/results.rst",
+    "compute": "../report/compute.rst",
+}
 if any(task.endswith("-Push") for task in CONFIG.tasks):
     TABLES["push_split"] = "../report/push_split.rst"
 

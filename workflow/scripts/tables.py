@@ -1,4 +1,4 @@
-"""Table I, the full results, and the parts of the Push returns."""
+"""Table I, the full results, what they cost, and the parts of the Push returns."""
 
 from pathlib import Path
 
@@ -11,11 +11,13 @@ learned = pd.read_csv(given.scores)
 learned = learned[learned["task"].isin(params.tasks) & learned["variant"].isin(params.variants)]
 scores = pd.concat([learned, pd.read_csv(given.controllers)], ignore_index=True)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
-missing = statistics.missing_runs(expected, pd.read_csv(given.runs))
+runs = pd.read_csv(given.runs)
+missing = statistics.missing_runs(expected, runs)
 rule = tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
 made = [
     tables.table_one(learned, missing=missing, rule=rule, tasks=params.tasks),
     tables.full_results(scores, missing=missing, rule=rule),
+    tables.compute(runs),
 ]
 if params.push:
     made.append(tables.push_split(scores, missing=missing))
