@@ -14,7 +14,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -30,6 +30,9 @@ from safemr.plotting.aircraft import Slice
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
 from safemr.tables import ABSENT, Table, describe_missing
+
+if TYPE_CHECKING:
+    from safemr.policies import Policy
 
 FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
 MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -52,7 +55,7 @@ class _Straight:
         return np.zeros((len(observations), 1), np.float32)
 
 
-class _Obedient:
+class Obedient:
     """The least turn that keeps g <= 0 (Eq. cstr0, eta 0), else the one with the least g.
 
     What a perfect learner of this certificate would do: collisions it has are the certificate's.
@@ -99,13 +102,13 @@ def compare(
     rows = [
         {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
         | _certificate(truth, **saved)
-        | _flights(policy, starts, truth)
-        for run, saved, policy in _learners(root, runs)
+        | flights_of(policy, starts, truth)
+        for run, saved, policy in learners(root, runs)
     ]
     rows += [
         {"kind": "certificate", "variant": name, "seed": -1}
         | _certificate(truth, zeta, length_scale=1.0, eta=0.0)
-        | _flights(_obeying(truth, zeta), starts, truth)
+        | flights_of(_obeying(truth, zeta), starts, truth)
         for name, zeta in CERTIFICATES.items()
     ]
     wider = adversarial(truth.states) <= 0
@@ -115,8 +118,9 @@ def compare(
         | {"iou": float((wider & truth.unsafe).sum() / (wider | truth.unsafe).sum())},
         {"kind": "policy", "variant": TRUE_SET, "seed": -1}
         | {"volume_ratio": 1.0, "missed_share": 0.0, "iou": 1.0}
-        | _flights(aircraft.OptimalEvader(solution), starts, truth),
-        {"kind": "policy", "variant": STRAIGHT, "seed": -1} | _flights(_Straight(), starts, truth),
+        | flights_of(aircraft.OptimalEvader(solution), starts, truth),
+        {"kind": "policy", "variant": STRAIGHT, "seed": -1}
+        | flights_of(_Straight(), starts, truth),
     ]
     table = pd.DataFrame(rows)
     table["covers"] = table["missed_share"] <= aircraft.COVERS
@@ -142,6 +146,15 @@ def learned_zetas(comparison: pd.DataFrame, variant: str) -> list[tuple[Floats, 
     ]
 
 
+def plane(spacing: float) -> tuple[Floats, Floats]:
+    """x [X] and y [Y] of a regular grid over the box where encounters start."""
+    x, y = (
+        np.arange(low, high + spacing / 2, spacing)
+        for low, high in zip(BOX_LOW, BOX_HIGH, strict=True)
+    )
+    return x, y
+
+
 def slices(
     solution: Solution,
     adversarial: Solution,
@@ -154,10 +167,7 @@ def slices(
     The learned ones are those whose zeta is trained; every set contains the disc.
     """
     dynamics = solution.dynamics
-    x, y = (
-        np.arange(low, high + spacing / 2, spacing)
-        for low, high in zip(BOX_LOW, BOX_HIGH, strict=True)
-    )
+    x, y = plane(spacing)
     zetas = {
         str(variant): learned_zetas(comparison, str(variant))
         for variant in comparison["variant"].unique()
@@ -187,10 +197,11 @@ def slices(
     return x, y, cuts
 
 
-def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = None) -> Table:
-    """Learners (mean over seeds and half width of the 95% t interval), then the references."""
-    learners = comparison[comparison["kind"] == "learner"]
-    groups = list(learners.groupby("variant", sort=False))
+def table_lines(comparison: pd.DataFrame) -> pd.DataFrame:
+    """What a reader sees: learners (mean over seeds and half width of the 95% t interval), then
+    the other rows as they are."""
+    trained = comparison[comparison["kind"] == "learner"]
+    groups = list(trained.groupby("variant", sort=False))
     groups += [
         (comparison["variant"][index], comparison.loc[[index]])
         for index in comparison.index[comparison["kind"] != "learner"]
@@ -217,6 +228,11 @@ def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = No
                 "effort": _cell(group["effort"], 1, 2),
             }
         )
+    return pd.DataFrame(lines)
+
+
+def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = None) -> Table:
+    """Learners (mean over seeds and half width of the 95% t interval), then the references."""
     caption = (
         "Aircraft. Unsafe sets against the true one (constant traffic): volume over that of the "
         "truth; share of the truth minus the collision disc that is missed (covers: at most "
@@ -227,10 +243,12 @@ def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = No
         "mean sum of a^2. The policy of a fixed certificate keeps its constraint with the least "
         "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval."
     )
-    notes = [_verdict(as_scores(comparison))] if len(learners) else []
+    trained = (comparison["kind"] == "learner").any()
+    notes = [_verdict(as_scores(comparison))] if trained else []
     if missing is not None and len(missing):
         notes.append(f"Runs missing: {describe_missing(missing)}.")
-    return Table("aircraft", caption, comparison, pd.DataFrame(lines), tuple(filter(None, notes)))
+    lines = table_lines(comparison)
+    return Table("aircraft", caption, comparison, lines, tuple(filter(None, notes)))
 
 
 def _verdict(scores: pd.DataFrame, method: str = "SafeMR", rival: str = "JointSIS") -> str:
@@ -262,8 +280,13 @@ def _cell(values: pd.Series, factor: float, digits: int) -> str:
     return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
 
 
-def _learners(root: Path, runs: pd.DataFrame) -> Sequence[tuple[Any, dict[str, Any], Acts]]:
-    """(run, zeta with length_scale and eta, policy) of every record."""
+def learners(
+    root: Path, runs: pd.DataFrame, needed: Sequence[str] = ("zeta", "length_scale")
+) -> Sequence[tuple[Any, dict[str, Any], Policy]]:
+    """(run, zeta with length_scale and eta, policy) of every record.
+
+    Raises UserError naming every record whose policy file lacks an array of ``needed``.
+    """
     from safemr.policies import load_policy  # torch, which reading a comparison does not need
 
     found, lacking = [], []
@@ -273,7 +296,7 @@ def _learners(root: Path, runs: pd.DataFrame) -> Sequence[tuple[Any, dict[str, A
             lacking.append(str(run.folder))
             continue
         policy = load_policy(folder)
-        if not {"zeta", "length_scale"} <= policy.extras.keys():
+        if not set(needed) <= policy.extras.keys():
             lacking.append(str(run.folder))
             continue
         config = json.loads((folder / records.CONFIG).read_text())
@@ -285,8 +308,8 @@ def _learners(root: Path, runs: pd.DataFrame) -> Sequence[tuple[Any, dict[str, A
         found.append((run, saved, policy))
     if lacking:
         raise UserError(
-            f"no {records.POLICY} with zeta and length_scale in {', '.join(lacking)}: remove these "
-            "records to train them again, or take them out of aircraft.algorithms"
+            f"no {records.POLICY} with {' and '.join(needed)} in {', '.join(lacking)}: remove "
+            "these records to train them again, or take them out of aircraft.algorithms"
         )
     return found
 
@@ -304,9 +327,10 @@ def _certificate(
     }
 
 
-def _obeying(truth: Truth, zeta: Sequence[float]) -> _Obedient:
-    return _Obedient(truth.dynamics, aircraft.energy_certificate(truth.dynamics, zeta))
+def _obeying(truth: Truth, zeta: Sequence[float]) -> Obedient:
+    return Obedient(truth.dynamics, aircraft.energy_certificate(truth.dynamics, zeta))
 
 
-def _flights(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
+def flights_of(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
+    """`safemr.aircraft.Flights.summary` of a policy from ``starts`` [N, 3]."""
     return aircraft.fly(policy, starts, truth.dynamics).summary()

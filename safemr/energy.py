@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 # d, d_dot, sigma, ... are floats, numpy arrays or torch tensors; the formulas do not care.
 Array = Any
 
@@ -47,3 +49,25 @@ def magnitude(d_min: Array, sigma: Array, k: Array, n: Array, a: float, b: float
 def scaled(d: Array, d_dot: Array, d_min: Array, length_scale: float) -> tuple[Array, Array, Array]:
     """(d, d_dot, d_min) in units of ``length_scale`` [m]; seconds stay seconds."""
     return d / length_scale, d_dot / length_scale, d_min / length_scale
+
+
+def softplus(x: Array) -> Array:
+    """log(1 + e^x), elementwise."""
+    return x.logaddexp(x.new_zeros(())) if hasattr(x, "logaddexp") else np.logaddexp(0.0, x)
+
+
+def corrected(phi: Array, contact: Array, correction: Array, smoothing: float) -> Array:
+    """The soft maximum of ``contact`` and phi + gate ``correction``; all of one shape.
+
+    ``contact`` is d_min - d, which is phi_0. The result exceeds the larger of the two by at most
+    tau log 2, tau = ``smoothing``, so it is positive in the whole collision disc. The gate
+    1 - e^((d_min - d) / tau) is 0 in the disc, and nearly 1 from a few tau outside.
+    """
+    outside = -(contact * (contact < 0))
+    gate = 1.0 - np.e ** (-outside / smoothing)
+    return contact + smoothing * softplus((phi + gate * correction - contact) / smoothing)
+
+
+def mean_positive_part(phi: Array, smoothing: float) -> Array:
+    """E[tau log(1 + e^(phi / tau))], tau = ``smoothing``: the magnitude of any energy, a number."""
+    return smoothing * softplus(phi / smoothing).mean()

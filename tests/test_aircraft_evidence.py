@@ -274,10 +274,12 @@ def test_shipped_learners_start_alike_and_mean_the_papers_certificates(name: str
 
 
 def test_the_papers_grid_has_the_same_learners_as_the_quick_one() -> None:
-    """But for the run in metres, which shows once what the paper's a and b do unscaled."""
+    """But for the run in metres, which shows once what the paper's a and b do unscaled, and for
+    the neural energy functions, which are beyond the paper."""
     quick, paper = (
         yaml.safe_load((ROOT / f"config/{name}.yaml").read_text())["aircraft"]["algorithms"]
         for name in ("config", "paper")
     )
     quick.pop("SafeMR-metres")
-    assert quick == paper
+    papers = {k: v for k, v in quick.items() if v["algorithm"] != "neural_safemr"}
+    assert papers == paper

@@ -7,7 +7,7 @@ metres: ``truth`` is the value V (unsafe where <= 0), the others are unsafe wher
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -202,4 +202,43 @@ def frontier(best: pd.DataFrame, comparison: pd.DataFrame, covers: float) -> Fig
         Patch(fc="0.93", label=f"covers ({100 * covers:g}% missed or less)"),
     ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+@style.styled
+def neural(
+    x: Array,
+    y: Array,
+    cut: Slice,
+    d_min: float,
+    best: pd.DataFrame,
+    comparison: pd.DataFrame,
+    covers: float,
+) -> Figure:
+    """Neural energies: (a) on the trade-off between volume and coverage, (b) one slice of them.
+
+    ``comparison`` holds rows of kind "learner" and, of kind "control", the curve of the same
+    function fitted to the truth.
+    """
+    figure = style.new_figure(style.TEXT_WIDTH, 3.5)
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+    draw_frontier(left, best, comparison, covers)
+    control = comparison[comparison["kind"] == "control"].sort_values("missed_share")
+    left.plot(100 * control["missed_share"], control["volume_ratio"], color="k", lw=1.2, ls="--")
+    draw_slice(right, x, y, cut, d_min)
+    draw_aircraft(right, x[-1] - 2.4, y[-1] - 2.4, cut.psi, "0.35")
+    right.set(xlabel="$x$ ahead (m)", ylabel="$y$ left (m)")
+    for ax, letter in ((left, "a"), (right, "b")):
+        style.panel_letter(ax, letter)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color="k", lw=1.4, label=r"frontier over $[\sigma,k,n]$"),
+        Line2D([], [], color="k", lw=1.2, ls="--", label="network fitted to the truth"),
+        *(
+            Line2D([], [], color=style.colour(v), marker=style.marker(v), ms=4.5, lw=1.0,
+                   ls=_dash(v) if v in cut.learned else "none", label=style.label(v))
+            for v in style.ordered(_moving(comparison))
+        ),
+        *_handles(replace(cut, learned={})),
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
     return figure

@@ -1,6 +1,11 @@
 # The aircraft experiment: its learners are runs of the one training rule. The solved truth is kept
 # in <results root>/.work/aircraft, which no record needs and a clone solves again (15 s).
-AIRCRAFT = [run for run in PLAN.aircraft if run in RECORDED]
+# Those with a neural energy function have a table and a figure of their own, and are made when
+# aircraft.algorithms has any.
+NEURAL_PLAN = [run for run in PLAN.aircraft if run.config["algorithm"]["name"] == "neural_safemr"]
+AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
+AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]
+NEURAL = [run for run in NEURAL_PLAN if run in RECORDED]
 AIRCRAFT_FIGURES = ["aircraft_slices", "aircraft_airplane", "aircraft_frontier"]
 
 
@@ -36,7 +41,7 @@ rule aircraft_comparison:
         cache=f"{RESULTS}/.work/aircraft",
         root=RESULTS,
         folders=[run.path.as_posix() for run in AIRCRAFT],
-        expected=expected(PLAN.aircraft),
+        expected=expected(AIRCRAFT_PLAN),
     message:
         "Comparing %d learned certificates with the true unsafe set" % len(AIRCRAFT)
     script:
@@ -63,5 +68,41 @@ rule aircraft_figures:
         "../scripts/aircraft_figures.py"
 
 
+rule aircraft_neural:
+    input:
+        record_files(NEURAL),
+        comparison=rules.aircraft_comparison.output.comparison,
+        frontier=rules.aircraft_frontier.output[0],
+    output:
+        comparison=f"{SUMMARY}/aircraft_neural.csv",
+        table=expand(f"{RESULTS}/tables/aircraft_neural.{{end}}", end=["csv", "tex"]),
+        markdown=report(
+            f"{RESULTS}/tables/aircraft_neural.md",
+            caption="../report/aircraft_neural.rst",
+            category="Tables",
+        ),
+        pdf=f"{FIGURES}/aircraft_neural.pdf",
+        png=report(
+            f"{FIGURES}/aircraft_neural.png",
+            caption="../report/aircraft_neural.rst",
+            category="Figures",
+        ),
+    log:
+        f"{LOGS}/aircraft_neural.log",
+    threads: 1
+    params:
+        cache=f"{RESULTS}/.work/aircraft",
+        root=RESULTS,
+        folders=[run.path.as_posix() for run in NEURAL],
+        expected=expected(NEURAL_PLAN),
+        energy=[run.config["algorithm"]["hyperparameters"] for run in NEURAL_PLAN[:1]],
+    message:
+        "Comparing %d neural certificates with the true unsafe set" % len(NEURAL)
+    script:
+        "../scripts/aircraft_neural.py"
+
+
 if CONFIG.aircraft:
     TARGETS += [*rules.aircraft_comparison.output, *rules.aircraft_figures.output]
+if NEURAL_PLAN:
+    TARGETS += [*rules.aircraft_neural.output]

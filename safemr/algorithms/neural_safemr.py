@@ -1,0 +1,192 @@
+"""SafeMR with a small neural energy function, the extension that the paper names as future work.
+
+A network f corrects the handcrafted energy, whose zeta = [sigma, k, n] stays fixed; what it cannot
+touch is contact:
+
+    phi(s) = softmax_tau(phi_0(s), phi_zeta(s) + gate(d) f_theta(s)),    gate(d <= d_min) = 0.
+
+So phi > 0 wherever d < d_min, whatever theta, and phi = phi_zeta at the start, where f = 0. The
+rest is feasible actor-critic with this phi; theta takes the place of zeta in the last step.
+
+| equation of the paper | function |
+|---|---|
+| phi (sis), neural | `safemr.energy.corrected`, `neural_energy` |
+| a (sigma + d_min)^n + b k (sisadd) | `safemr.energy.mean_positive_part` |
+| certificate loss (SL2add) | `certificate_loss` |
+
+Magnitude. The paper's term is the energy at two points: (sigma + d_min)^n is phi at d = d_dot = 0,
+and k is what one unit of closing speed adds. Three parameters move with them, a network would not.
+Here it is a times the mean of phi's positive part over the states in memory (smoothed by tau). For
+eta_D = 0 this has the right solution: of all functions that are at least the energy at contact
+and keep g <= 0 under the best policy, the least has the true unsafe set as its positive set.
+
+Deviations. (1) The derivative of max(phi(s) - eta_D, 0) is taken as 1 everywhere (``through``).
+By the paper's own (``literal``) no state outside the unsafe set is ever moved into it: where a
+flight enters, phi(s') falls and phi(s) stays. (2) The constraint enters as max(g, 0): with a floor
+below 0 phi would have to fall along every flight that keeps it. (3) Adam, since theta has no scale
+of its own. docs/aircraft.md reports what this does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from safemr import energy
+from safemr.algorithms import fac
+from safemr.buffers import Batch
+from safemr.errors import UserError
+from safemr.networks import StackedMLP
+from safemr.policies import network_arrays
+from safemr.training import generator
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Config(fac.Config):
+    """FAC's hyperparameters, sigma, k, n being the fixed handcrafted part, and those of f."""
+
+    n_step: int = 1  # the energy needs the next state, which the bootstrap then is
+    a: float = 10.0  # weight of the magnitude term
+    smoothing: float = 0.1  # tau, in units of length_scale
+    certificate_hidden: int = 32  # width of f's two hidden layers (tanh)
+    certificate_lr: float = 1e-3
+    certificate_delay: int = 4  # m_phi
+    certificate_start: float = 0.05  # share of training before theta moves
+    certificate_derivative: Literal["through", "literal"] = "through"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("smoothing", "certificate_hidden", "certificate_lr", "certificate_delay"):
+            if not getattr(self, name) > 0:
+                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
+        if not self.a >= 0:
+            raise UserError(f"a = {self.a!r} must not be negative")
+        if not 0 <= self.certificate_start < 1:
+            raise UserError(f"certificate_start = {self.certificate_start!r} must lie in [0, 1)")
+        if self.n_step != 1:
+            raise UserError(f"n_step = {self.n_step!r} must be 1: the energy needs the next state")
+        if self.certificate_derivative not in ("through", "literal"):
+            raise UserError(
+                f"certificate_derivative = {self.certificate_derivative!r}: use 'through' or "
+                "'literal'"
+            )
+
+
+def neural_energy(
+    network: StackedMLP,
+    observations: Tensor,
+    d: Tensor,
+    d_dot: Tensor,
+    d_min: float,
+    *,
+    zeta: Tensor,
+    length_scale: float,
+    smoothing: float,
+) -> Tensor:
+    """phi [B] at transformed observations [B, D] with d, d_dot [B, M], differentiable in theta.
+
+    Over M obstacles phi_0 and phi_zeta are the largest.
+    """
+    d, d_dot, least = energy.scaled(d, d_dot, d_min, length_scale)
+    handcrafted = energy.largest(energy.energy(d, d_dot, least, *zeta.unbind()))
+    contact = energy.largest(least - d)
+    return energy.corrected(handcrafted, contact, network(observations)[0, :, 0], smoothing)
+
+
+def certificate_loss(phi: Tensor, phi_next: Tensor, multipliers: Tensor, config: Config) -> Tensor:
+    """E[lambda(s) max(phi(s') - max(phi(s) - eta_D, 0), 0)] + a E[phi's positive part] (SL2add)."""
+    g = energy.constraint(phi, phi_next, config.eta)
+    if config.certificate_derivative == "through":
+        g = energy.constraint(phi.detach(), phi_next, config.eta) - (phi - phi.detach())
+    magnitude = energy.mean_positive_part(phi, config.smoothing)
+    return (multipliers * g.clamp_min(0.0)).mean() + config.a * magnitude
+
+
+class Agent(fac.Agent):
+    """Feasible actor-critic whose energy's correction descends `certificate_loss`."""
+
+    config: Config
+
+    def __init__(
+        self,
+        config: Config,
+        observation_dim: int,
+        action_dim: int,
+        d_min: float,
+        seed: int,
+        total_updates: int,
+    ) -> None:
+        super().__init__(config, observation_dim, action_dim, d_min, seed, total_updates)
+        width = config.certificate_hidden
+        self.certificate = StackedMLP(
+            1,
+            (observation_dim, width, width, 1),
+            "tanh",
+            generator=generator(seed, 5),
+            output_gain=0.0,
+            device=config.device,
+        )
+        self.optimisers["certificate"] = self.adam(
+            self.certificate.parameters, config.certificate_lr
+        )
+        self._first_update = int(config.certificate_start * self.total_updates)
+
+    def energies(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """phi(s) and phi(s'), [B] each."""
+        phi = neural_energy(
+            self.certificate,
+            torch.cat((batch.observations, batch.bootstraps)),
+            torch.cat((batch.d, batch.d_next)),
+            torch.cat((batch.d_dot, batch.d_dot_next)),
+            self.d_min,
+            zeta=self.zeta,
+            length_scale=self.config.length_scale,
+            smoothing=self.config.smoothing,
+        )
+        now, following = phi.chunk(2)
+        return now, following
+
+    def constraint_target(self, batch: Batch) -> Tensor:
+        g = energy.constraint(*self.energies(batch), self.config.eta)
+        return g.clamp_min(self.config.constraint_floor)
+
+    def update_certificate(self, batch: Batch) -> fac.Info:
+        """A step of Adam on theta every m_phi updates (Algorithm 1, last line)."""
+        if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
+            return {}
+        with torch.no_grad():
+            multipliers = self.multipliers(batch.observations)
+        phi, phi_next = self.energies(batch)
+        loss = certificate_loss(phi, phi_next, multipliers, self.config)
+        parameters = self.certificate.parameters
+        (gradient,) = torch.autograd.grad(loss, [parameters])
+        parameters.grad = gradient
+        self.optimisers["certificate"].step()
+        return {
+            "certificate_loss": loss.detach(),
+            "certificate_grad_norm": gradient.norm(),
+            "certificate_unsafe_share": (phi.detach() > 0).float().mean(),
+        }
+
+    def extras(self) -> dict[str, Any]:
+        """FAC's, with f's network: what `safemr.neural_evidence.neural_certificate` reads."""
+        return {
+            **super().extras(),
+            **network_arrays("certificate", self.certificate),
+            "smoothing": np.array(self.config.smoothing),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        state = super().state_dict()
+        state["networks"]["certificate"] = self.certificate.parameters.detach()
+        return state
+
+
+class Trainer(fac.Trainer):
+    agent_type = Agent
