@@ -20,11 +20,12 @@ from safemr.statistics import Estimate
 MISSING = "missing"
 ABSENT = "–"
 
-# Columns of the full results: metric of the deterministic evaluation -> heading.
+# Columns of the full results: metric -> heading. All but one are of the deterministic evaluation.
 RESULT_METRICS = {
     "eval_return": "return",
     "eval_cost": "cost",
     "eval_cost_indicator": "violating steps",
+    "train_cost_indicator": "the same, exploring",
     "eval_cost_contact": "any contact",
     "eval_zero_violation_share": "clean episodes",
     "eval_violation_rate": "violation rate",
