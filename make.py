@@ -12,6 +12,7 @@ it was interrupted.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import fcntl
 import hashlib
@@ -40,7 +41,7 @@ def main(arguments: Sequence[str]) -> int:
     if command == "lock" and not rest:
         return write_lock()
     if command == "all":
-        return run("python", "-m", "snakemake", "-j2", "--keep-going", "all", *rest)
+        return check(rest) or run("python", "-m", "snakemake", "-j2", "--keep-going", "all", *rest)
     if command == "test":
         return run("python", "-m", "pytest", "-n", "2", "-m", "not slow", *rest)
     if command == "run" and rest and rest != ["--"]:
@@ -65,6 +66,14 @@ def run(*command: str) -> int:
         return subprocess.run([program, *command[1:]], cwd=ROOT, env=variables).returncode
     except KeyboardInterrupt:
         return 130
+
+
+def check(arguments: Sequence[str]) -> int:
+    """Say in one line what is wrong with a --configfile; Snakemake would show a traceback."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", default=[])
+    files = parser.parse_known_args(arguments)[0].configfile
+    return run("python", "-m", "safemr.cli", "config", "config/config.yaml", *files) if files else 0
 
 
 def environment() -> Path:

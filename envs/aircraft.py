@@ -154,7 +154,10 @@ class _Encounters:
         self, actions: ArrayLike
     ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, NDArray[Any]]]:
         """One control period: rewards, terminated, truncated [N] and info of the states reached."""
-        turns = np.asarray(actions, float)
+        given = np.asarray(actions)
+        if given.dtype.kind not in "fiu":
+            raise ValueError(f"actions must be real numbers, not {given.dtype}")
+        turns = given.astype(float)
         if turns.shape != (self.num_envs, 1):
             raise ValueError(f"actions must have shape ({self.num_envs}, 1), not {turns.shape}")
         if not np.all(np.isfinite(turns)):

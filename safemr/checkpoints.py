@@ -1,4 +1,4 @@
-"""Interrupted runs: lock, checkpoints, and the session that a training program works in.
+"""Interrupted runs: checkpoints, and the session that a training program works in.
 
 Everything unfinished lives in ``<results root>/.work/<digest>/``, which no Snakemake rule declares,
 so that a failed or killed job cannot take it away; it is removed when the record is written.
@@ -16,13 +16,10 @@ so that a failed or killed job cannot take it away; it is removed when the recor
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import shutil
 import signal
-import socket
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -32,73 +29,20 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from safemr import provenance, records
-from safemr.errors import UserError
+from safemr import atomic, provenance, records
+from safemr.errors import UserError, tell
+from safemr.locks import ProcessLock
 
 CHECKPOINT, ATTEMPTS, LOCK = "checkpoint.pt", "attempts.jsonl", "lock"
 SHARE = 0.02  # the largest share of the run time that checkpoints may take
 _ARRAY = "ndarray"  # the key that marks an encoded NumPy array
 
 
-class RunLockedError(UserError):
-    """Another live process works on the same run."""
-
-    exit_code = 3
-
-
-class RunLock:
-    """One process a run, by an advisory lock that the kernel drops when its owner dies.
-
-    There is no stale lock to recognise and no process number to mistake for another's, also after
-    SIGKILL, a reboot or in a container. The file's text only says who the owner is.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._descriptor: int | None = None
-
-    def acquire(self, *, wait: bool) -> None:
-        """Take the lock; when it is held, wait for its owner to end, or raise RunLockedError."""
-        announced = False
-        while not self._try():
-            owner = self.path.read_text(errors="replace").strip() or "another process"
-            if not wait:
-                raise RunLockedError(
-                    f"{self.path.parent.name} is being trained by {owner}; wait for it or stop it"
-                )
-            if not announced:
-                print(f"waiting for {owner}, which trains the same run", file=sys.stderr)
-                announced = True
-            time.sleep(0.5)
-
-    def _try(self) -> bool:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # The previous owner may have removed the file between our open and our lock.
-            current = os.stat(self.path).st_ino == os.fstat(descriptor).st_ino
-        except (BlockingIOError, FileNotFoundError):
-            current = False
-        if not current:
-            os.close(descriptor)
-            return False
-        os.ftruncate(descriptor, 0)
-        os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
-        self._descriptor = descriptor
-        return True
-
-    def release(self) -> None:
-        """Drop the lock; the file may stay."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
-
 def encode(value: Any, where: str = "state") -> Any:
     """Nested containers of arrays and plain values as what ``torch.load(weights_only=True)`` reads.
 
-    NumPy arrays become tensors that share their memory, under a marking key.
+    NumPy arrays become tensors that share their memory, under a marking key; tensors that show a
+    part of a larger memory are copied, because torch saves the memory and not the part.
 
     Raises:
         TypeError: naming the entry that is neither an array nor a plain value.
@@ -112,7 +56,9 @@ def encode(value: Any, where: str = "state") -> Any:
     if isinstance(value, (list, tuple)):
         items = (encode(item, f"{where}[{index}]") for index, item in enumerate(value))
         return type(value)(items)
-    if value is None or isinstance(value, (bool, int, float, str, torch.Tensor)):
+    if isinstance(value, torch.Tensor):
+        return value if value.untyped_storage().nbytes() == value.nbytes else value.clone()
+    if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"{where} is a {type(value).__name__}, which a checkpoint cannot hold")
 
@@ -130,17 +76,8 @@ def decode(value: Any) -> Any:
 
 def save(path: Path, content: Mapping[str, Any]) -> None:
     """Write a checkpoint as a whole and durably; after a failure the previous one is untouched."""
-    temporary = path.with_suffix(".tmp")
-    try:
-        with open(temporary, "wb") as stream:
-            torch.save(encode(content), stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    records.sync_directory(path.parent)
+    with atomic.replacing(path) as stream:
+        torch.save(encode(content), stream)
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -156,7 +93,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def read_attempts(work: Path) -> list[dict[str, Any]]:
-    """The attempts at an unfinished run, and how they failed; a torn last line is left out."""
+    """The attempts at an unfinished run, and how they failed; a torn line is left out."""
     events = []
     for line in (work / ATTEMPTS).read_text().splitlines():
         with contextlib.suppress(ValueError):
@@ -174,7 +111,8 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         wait: When another process works on the same run, wait for it instead of failing.
         die_with_parent: Stop, with a checkpoint, when the parent process (Snakemake) is gone.
         minimum_interval: Seconds between checkpoints at least; they are rarer where writing one
-            takes long, so that they cost at most 2% of the time.
+            takes long: one is due when, at the mean cost of those before, all of them together
+            stay within 2% of the time.
 
     Attributes:
         folder: The record's folder.
@@ -199,13 +137,14 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         self.rows: list[dict[str, float]] = []
         self.complete = False
         self._wait, self._minimum_interval = wait, minimum_interval
-        self._lock = RunLock(self.work / LOCK)
+        self._lock = ProcessLock(self.work / LOCK, f"trains the run {self.digest}")
         self._parent = os.getppid() if die_with_parent else None
         self._signal: signal.Signals | None = None
         self._handlers: dict[signal.Signals, Any] = {}
         self._earlier = {"wall_s": 0.0, "cpu_s": 0.0}
         self._started = time.monotonic()
         self._due = self._started + minimum_interval
+        self._costs: list[float] = []  # seconds of each checkpoint written
 
     def __enter__(self) -> Self:
         self._lock.acquire(wait=self._wait)
@@ -238,7 +177,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
                 self._earlier = dict(content["elapsed"])
             except (UserError, KeyError, TypeError, ValueError) as error:
                 content = None
-                print(f"warning: starting again from step 0: {error}", file=sys.stderr)
+                tell(f"warning: starting again from step 0: {error}")
         step = int(self.rows[-1]["step"]) if self.rows else 0
         self._note({"started": provenance.now(), "step": step, **provenance.source_revision()})
         return content["state"] if content else None
@@ -259,7 +198,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         self.rows.append(dict(row))
         with self._survive_full_disk("progress"):
             text = records.format_progress(self.rows)
-            records.atomic_write(self.work / records.PROGRESS, text.encode(), durable=False)
+            atomic.write(self.work / records.PROGRESS, text.encode(), durable=False)
 
     def maybe_checkpoint(self, state: Callable[[], Mapping[str, Any]]) -> None:
         """Save ``state()`` when one is due or the process was told to stop; in that case exit."""
@@ -271,11 +210,12 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
             content = {"rows": self.rows, "elapsed": self.elapsed(), "state": state()}
             save(self.work / CHECKPOINT, content)
         ended = time.monotonic()
-        self._due = ended + max(self._minimum_interval, (ended - begun) / SHARE)
+        self._costs.append(ended - begun)
+        with_next = sum(self._costs) * (1 + 1 / len(self._costs))
+        self._due = max(ended + self._minimum_interval, self._started + with_next / SHARE)
         if reason is not None:
             step = int(self.rows[-1]["step"]) if self.rows else 0
-            print(f"stopped by {reason} at step {step}; the same command continues here",
-                  file=sys.stderr)  # fmt: skip
+            tell(f"stopped by {reason} at step {step}; the same command continues here")
             raise SystemExit(128 + (self._signal or signal.SIGTERM))
 
     def finish(self, policy: Mapping[str, np.ndarray] | None) -> None:
@@ -284,7 +224,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         origin = {
             **provenance.collect(),
             **{name: round(value, 3) for name, value in self.elapsed().items()},
-            "started": attempts[0]["started"],
+            "started": next((e["started"] for e in attempts if "started" in e), None),
             "finished": provenance.now(),
             "attempts": [{k: v for k, v in event.items() if k != "run"} for event in attempts],
         }
@@ -300,7 +240,8 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
     def _note(self, event: Mapping[str, Any]) -> None:
         label = f"{self.variant} {self.config['task']['name']} seed {self.config['seed']}"
         with open(self.work / ATTEMPTS, "a") as stream:
-            stream.write(json.dumps({"run": label, **event}) + "\n")
+            # The line break comes first: a line torn by a power failure spoils only itself.
+            stream.write("\n" + json.dumps({"run": label, **event}))
 
     def _reason_to_stop(self) -> str | None:
         if self._signal is not None:
@@ -316,7 +257,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
 
     def _remove_temporary_files(self) -> None:
         for folder in (self.work, self.folder):
-            for leftover in (*folder.glob("*.tmp"), *folder.glob(".*.tmp")):
+            for leftover in folder.glob("*.tmp"):
                 leftover.unlink(missing_ok=True)
 
     @contextlib.contextmanager
@@ -328,7 +269,4 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
             cause = error if isinstance(error, OSError) else error.__context__
             if not isinstance(cause, OSError):
                 raise
-            print(
-                f"warning: no new {what} in {self.work}: {cause.strerror}; the previous one stays",
-                file=sys.stderr,
-            )
+            tell(f"warning: no new {what} in {self.work}: {cause.strerror}; the previous one stays")

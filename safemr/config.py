@@ -118,19 +118,19 @@ def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None
     merged: dict[str, Any] = {}
     for path in files:
         merged |= read_yaml(Path(path))
-    return parse(merged | {key: _typed(value) for key, value in (overrides or {}).items()})
+    return parse(merged | {key: typed(value) for key, value in (overrides or {}).items()})
 
 
-def _typed(value: Any) -> Any:
-    """A value of ``--config``: inside lists and mappings Snakemake leaves every scalar as text."""
+def typed(value: Any) -> Any:
+    """A value of a command line: inside lists and mappings Snakemake leaves scalars as text."""
     if isinstance(value, str):
         try:
             return yaml.load(value, _StrictLoader)
-        except yaml.YAMLError:
+        except (yaml.YAMLError, ValueError, RecursionError):
             return value
     if isinstance(value, Mapping):
-        return {key: _typed(item) for key, item in value.items()}
-    return [_typed(item) for item in value] if isinstance(value, (list, tuple)) else value
+        return {key: typed(item) for key, item in value.items()}
+    return [typed(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -426,3 +426,12 @@ def _root(value: Any, where: str) -> Path:
     if Path(value).exists() and not Path(value).is_dir():
         raise UserError(f"{where} = {value!r} is a file; choose a folder")
     return Path(value)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Check configuration files, each put over the ones before it.
+
+    Raises:
+        UserError: as `load` does.
+    """
+    load(arguments)

@@ -1,6 +1,10 @@
-"""The one exception that means "the user can fix this"."""
+"""What the user is told: the one exception that means "the user can fix this", and messages."""
 
 from __future__ import annotations
+
+import contextlib
+import sys
+from typing import TextIO
 
 
 class UserError(Exception):
@@ -9,3 +13,13 @@ class UserError(Exception):
     Command-line entry points print it to standard error and exit with status 2; anything else that
     escapes is a bug and keeps its traceback.
     """
+
+
+def tell(message: str, stream: TextIO | None = None, *, end: str = "\n") -> None:
+    """Print to standard error, or to ``stream``, without ever failing.
+
+    Ctrl-C also ends the `tee` that a run writes to, and logs lie on disks that fill up: that nobody
+    hears is no reason to lose a run.
+    """
+    with contextlib.suppress(OSError):
+        print(message, file=stream or sys.stderr, end=end, flush=True)

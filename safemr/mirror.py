@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import sys
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
 
 from safemr.checkpoints import RunSession
+from safemr.errors import tell
 
 
 class Mirror(contextlib.AbstractContextManager["Mirror"]):
@@ -69,5 +69,5 @@ class Mirror(contextlib.AbstractContextManager["Mirror"]):
             action()
         except Exception as error:  # whatever wandb does, training goes on
             reason = str(error).partition("\n")[0]
-            print(f"warning: wandb is off for this run: {reason}", file=sys.stderr)
+            tell(f"warning: wandb is off for this run: {reason}")
             self._run = None

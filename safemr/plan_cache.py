@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from safemr import records, runs
+from safemr import atomic, runs
 from safemr.config import Config
 
 _SOURCES = Path(__file__).resolve().parents[1]
@@ -37,7 +37,7 @@ def plan_for(config: Config) -> runs.Plan:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps({"key": key, "plan": dataclasses.asdict(plan)})
-        records.atomic_write(path, text.encode(), durable=False)
+        atomic.write(path, text.encode(), durable=False)
     except OSError:
         pass  # only slower the next time
     return plan

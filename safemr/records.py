@@ -18,7 +18,6 @@ import hashlib
 import io
 import json
 import math
-import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from safemr import atomic
 from safemr.errors import UserError
 
 if TYPE_CHECKING:
@@ -69,35 +69,6 @@ def record_path(config: Mapping[str, Any], variant: str) -> Path:
     """The record's folder, relative to the results root."""
     seed = f"seed{config['seed']}-{config_digest(config)}"
     return Path("runs", config["task"]["name"], folder_name(variant), seed)
-
-
-def atomic_write(path: Path, content: bytes, *, durable: bool = True) -> None:
-    """Replace ``path`` by ``content`` as a whole: a reader or a crash sees the old or the new file.
-
-    ``durable`` also waits until the bytes are on the disk, so that a power failure cannot undo it.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as stream:
-            stream.write(content)
-            if durable:
-                stream.flush()
-                os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    if durable:
-        sync_directory(path.parent)
-
-
-def sync_directory(folder: Path) -> None:
-    """Make a rename inside ``folder`` durable."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def format_progress(rows: Sequence[Row]) -> str:
@@ -168,7 +139,7 @@ def write_record(
         contents[POLICY] = buffer.getvalue()
     (folder / PROVENANCE).unlink(missing_ok=True)
     for name, content in contents.items():
-        atomic_write(folder / name, content)
+        atomic.write(folder / name, content)
     closing = {
         **provenance,
         "schema": SCHEMA,
@@ -178,7 +149,7 @@ def write_record(
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()},
     }
     text = json.dumps(closing, sort_keys=True, indent=1, allow_nan=False) + "\n"
-    atomic_write(folder / PROVENANCE, text.encode())
+    atomic.write(folder / PROVENANCE, text.encode())
 
 
 def load_policy(path: Path) -> dict[str, np.ndarray]:

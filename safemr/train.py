@@ -17,13 +17,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-import yaml
-
 from safemr import records, runs
-from safemr.checkpoints import RunSession
-from safemr.errors import UserError
-
-WANDB_MODES = ("disabled", "offline", "online")
+from safemr.checkpoints import CHECKPOINT, RunSession
+from safemr.config import WANDB_MODES, typed
+from safemr.errors import UserError, tell
 
 
 def make_envs(task: Mapping[str, Any], num_envs: int) -> Any:
@@ -68,8 +65,7 @@ class Progress:
             f"{int(max(left, 0.0)) // 60}:{int(max(left, 0.0)) % 60:02d} left"
         )
         end = "\n" if not terminal or share >= 1.0 else ""
-        self._stream.write(("\r\x1b[K" if terminal else "") + line + end)
-        self._stream.flush()
+        tell(("\r\x1b[K" if terminal else "") + line, self._stream, end=end)
 
 
 def train(
@@ -89,6 +85,7 @@ def train(
 
     from safemr.evaluate import evaluate
     from safemr.mirror import Mirror
+    from safemr.training import check_finite
 
     # One run is one thread: at these sizes more threads only wait for each other.
     torch.set_num_threads(1)
@@ -108,13 +105,15 @@ def train(
     state = session.resume()
     if state is not None:
         trainer.load_state_dict(state)
-        print(f"{label} continues at step {trainer.step}", file=stream)
+        tell(f"{label} continues at step {trainer.step}", stream)
     progress = Progress(label, steps, stream)
     with Mirror(config, session, wandb or {}) as mirror:
         while trainer.step < steps:
             begun, before = time.perf_counter(), trainer.step
             metrics = trainer.advance(min((before // log_every + 1) * log_every, steps))
             trained = time.perf_counter()
+            parameters = trainer.policy.network.parameters.detach()
+            check_finite(trainer.step, {"policy_parameters": float(parameters.sum())})
             if trainer.step // evaluation["every"] > before // evaluation["every"]:
                 result = evaluate(trainer.policy, evaluation_envs, evaluation["seed"])
                 metrics |= {f"eval_{name}": value for name, value in result.items()}
@@ -168,10 +167,7 @@ def _override(text: str) -> tuple[str, Any]:
     name, separator, value = text.partition("=")
     if not separator or not name:
         raise UserError(f"--set {text}: write NAME=VALUE")
-    try:
-        return name.strip(), yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise UserError(f"--set {text}: the value is not valid YAML") from error
+    return name.strip(), typed(value)
 
 
 def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -232,7 +228,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             die_with_parent=arguments.die_with_parent,
         ) as session:
             if session.complete:
-                print(f"{label}: already recorded in {session.folder}", file=sys.stderr)
+                tell(f"{label}: already recorded in {session.folder}")
                 return 0
             try:
                 train(
@@ -244,17 +240,18 @@ def main(argv: Sequence[str] | None = None) -> int:
             except TrainingDivergedError as error:
                 session.fail(str(error))
                 last = int(session.rows[-1]["step"]) if session.rows else 0
-                print(
-                    f"error: {label}: {error}; last good log point: step {last}; unfinished files "
-                    f"are in {session.work}",
-                    file=sys.stderr,
-                )
+                path = session.work / CHECKPOINT
+                kept = f"last good checkpoint: {path}" if path.exists() else "no checkpoint yet"
+                tell(f"error: {label}: {error}; last good log point: step {last}; {kept}")
                 return 4
-            print(f"{label}: record in {session.folder}", file=sys.stderr)
+            tell(f"{label}: record in {session.folder}")
             return 0
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        tell(f"error: {error}")
         return int(getattr(error, "exit_code", 2))
+    except OSError as error:  # a full disk, a folder that is not ours; checkpoints are as they were
+        tell(f"error: cannot write under {arguments.root}: {error}")
+        return 2
 
 
 if __name__ == "__main__":

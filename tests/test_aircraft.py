@@ -166,12 +166,27 @@ def test_ends_of_an_episode(
     assert info["cost"] == info["cost_indicator"] == info["cost_contact"] == cost
 
 
-@pytest.mark.parametrize("action", [np.nan, np.inf])
-def test_actions_that_are_not_finite_are_refused(action: float):
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.array([[0.0], [np.nan], [0.0]], np.float32), "action nan of encounter 1"),
+        (np.array([[0.0], [np.inf], [0.0]], np.float32), "action inf of encounter 1"),
+        (np.zeros(3), "shape"),
+        (np.zeros((2, 1)), "shape"),
+        (np.zeros((3, 2)), "shape"),
+        (np.float32(0.0), "shape"),
+        ([["a"]] * 3, "real numbers"),
+        ([[1j]] * 3, "real numbers"),
+        ([[None]] * 3, "real numbers"),
+    ],
+)
+def test_bad_actions_are_named_and_change_nothing(actions: Any, message: str):
     batch = vector(3)
     batch.reset(seed=0)
-    with pytest.raises(ValueError, match="encounter 1"):
-        batch.step(np.array([[0.0], [action], [0.0]], np.float32))
+    before = batch.get_state()
+    with pytest.raises(ValueError, match=f"action.*{message}|{message}"):
+        batch.step(actions)
+    np.testing.assert_equal(batch.get_state(), before)
 
 
 def test_starts_fill_the_box_outside_the_disc():

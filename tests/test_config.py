@@ -408,38 +408,3 @@ def test_plans_are_remembered_until_something_changes(
     (tmp_path / "results/.work/plan.json").write_text("{")
     assert plan_for(config.parse(VALID)) == first
     assert len(calls) == 3
-
-
-@pytest.mark.parametrize(
-    ("value", "hint", "expected"),
-    [
-        (1, float, 1.0),
-        (True, bool, True),
-        ([1, 2], tuple[float, ...], (1.0, 2.0)),
-        ([1, 2], tuple[int, int], (1, 2)),
-        (None, int | None, None),
-        (3, int | None, 3),
-        ("elu", str, "elu"),
-    ],
-)
-def test_coercion_keeps_types(value: Any, hint: Any, expected: Any) -> None:
-    result = runs.coerce(value, hint, "x")
-    assert result == expected
-    assert type(result) is type(expected)
-
-
-@pytest.mark.parametrize(
-    ("value", "hint"),
-    [
-        (True, float),
-        (True, int),
-        (1.0, int),
-        ("1", float),
-        ([1], tuple[int, int]),
-        (1, bool),
-        (0, str),
-    ],
-)
-def test_coercion_refuses_what_is_not_the_type(value: Any, hint: Any) -> None:
-    with pytest.raises(UserError, match="x must be"):
-        runs.coerce(value, hint, "x")

@@ -40,6 +40,16 @@ def test_links_lead_somewhere(document):
     assert not missing
 
 
+def test_the_tests_that_guard_the_runs_exist():
+    named = set(re.findall(r"\btest_\w+", (ROOT / "docs/trust.md").read_text()))
+    files = list((ROOT / "tests").glob("test_*.py"))
+    existing = {path.stem for path in files}
+    for path in files:
+        existing.update(re.findall(r"^def (test_\w+)", path.read_text(), re.MULTILINE))
+    assert len(named) > 30
+    assert named <= existing
+
+
 def test_the_worked_example_is_an_algorithm_of_one_file():
     from safemr import runs
 

@@ -25,13 +25,15 @@ SMALL: dict[str, dict[str, Any]] = {
     "on_policy": {"epoch_steps": 320, "hidden": 16, "value_batch": 80, "policy_batch": 80},
 }
 
+SETTINGS = {"Hazards-0.15-Push": {"max_episode_steps": 50}}
 
-def small_run(name: str, steps: int = 1200) -> runs.Run:
+
+def small_run(name: str, steps: int = 1200, task: str = "Hazards-0.15-Push") -> runs.Run:
     algorithm = runs.load_algorithm(name)
     fields = algorithm.hyperparameters.__dataclass_fields__
     overrides = {k: v for k, v in SMALL[algorithm.family].items() if k in fields}
     return runs.make_run(
-        runs.describe_task("Hazards-0.15-Push", {"max_episode_steps": 50}),
+        runs.describe_task(task, SETTINGS.get(task, {})),
         algorithm,
         runs.hyperparameters(algorithm, overrides, name),
         variant=name,
@@ -100,10 +102,13 @@ def test_kills_at_random_moments(name: str, tmp_path: Path) -> None:
     assert outcome(run, tmp_path / "killed") == whole
 
 
+EVERY_ALGORITHM = [("Hazards-0.15-Push", name) for name in runs.algorithm_names()]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", runs.algorithm_names())
-def test_many_kills_of_every_algorithm(name: str, tmp_path: Path) -> None:
-    run = small_run(name, steps=2400)
+@pytest.mark.parametrize(("task", "name"), [*EVERY_ALGORITHM, ("Aircraft", "safemr")])
+def test_many_kills_of_every_algorithm(task: str, name: str, tmp_path: Path) -> None:
+    run = small_run(name, steps=2400, task=task)
     whole, duration = uninterrupted(run, tmp_path / "whole")
     for seed in range(5):
         root = tmp_path / f"killed{seed}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import fcntl
+import json
 import os
 import random
 import re
@@ -19,7 +20,8 @@ from typing import Any
 import pytest
 import yaml
 
-from safemr import config, records, runs
+from safemr import config, inspection, records, runs
+from safemr.locks import ProcessLock
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("Snakefile", "config", "envs", "safemr", "workflow")
@@ -44,6 +46,7 @@ class Checkout:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.started: list[subprocess.Popen[str]] = []
         for name in SOURCES:
             source, target = ROOT / name, folder / name
             if source.is_dir():
@@ -60,23 +63,28 @@ class Checkout:
         """The plan of the checkout, by this repository's own sources."""
         return runs.resolve(config.load([self.folder / "config/config.yaml"]))
 
-    def command(self, *arguments: str) -> list[str]:
-        return [sys.executable, "-m", "snakemake", "-j2", *arguments]
-
-    def snakemake(self, *arguments: str, check: bool = True) -> str:
+    def start(self, *arguments: str, log: str | None = None) -> subprocess.Popen[str]:
+        """Snakemake in a process group of its own, as a terminal would start it."""
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         environment.pop("PYTHONPATH", None)
-        done = subprocess.run(
-            self.command(*arguments),
-            cwd=self.folder,
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            timeout=300,
-        )
-        assert (done.returncode == 0) == check, done.stdout
-        return done.stdout
+        with open(self.folder / log if log else os.devnull, "a") as stream:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "snakemake", "-j2", *arguments],
+                cwd=self.folder,
+                env=environment,
+                text=True,
+                stdout=stream if log else subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self.started.append(process)
+        return process
+
+    def snakemake(self, *arguments: str, check: bool = True) -> str:
+        process = self.start(*arguments)
+        printed, _ = process.communicate(timeout=600)
+        assert (process.returncode == 0) == check, printed
+        return printed
 
     def scheduled(self, *arguments: str) -> dict[str, int]:
         """Rule -> number of jobs of a dry run."""
@@ -99,10 +107,14 @@ class Checkout:
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Checkout:
+def checkout(tmp_path: Path) -> Iterator[Checkout]:
     copy = Checkout(tmp_path)
     copy.configure()
-    return copy
+    yield copy
+    for process in copy.started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 def test_the_shipped_default_schedules_every_run_once(tmp_path: Path) -> None:
@@ -245,22 +257,10 @@ def wait_until(condition: Any, *arguments: Any, seconds: float = 240) -> None:
         time.sleep(0.05)
 
 
-@pytest.fixture
-def started(checkout: Checkout) -> Iterator[subprocess.Popen[bytes]]:
-    checkout.configure(seeds=[100])
-    with open(checkout.folder / "first.log", "wb") as log:
-        process = subprocess.Popen(
-            checkout.command("all"), cwd=checkout.folder, stdout=log, stderr=log
-        )
-    yield process
-    process.kill()
-    process.wait()
-
-
-def test_from_nothing_to_figures_across_a_kill(
-    checkout: Checkout, started: subprocess.Popen[bytes]
-) -> None:
+def test_from_nothing_to_figures_across_a_kill(checkout: Checkout) -> None:
     """SIGKILL to Snakemake in the middle of training; the same command ends with every figure."""
+    checkout.configure(seeds=[100])
+    started = checkout.start("all", log="first.log")
     wait_until(begun, checkout)
     started.kill()
     started.wait()
@@ -277,20 +277,77 @@ def test_from_nothing_to_figures_across_a_kill(
     assert checkout.scheduled() == {}
 
 
+def test_a_second_snakemake_waits_for_the_first(checkout: Checkout) -> None:
+    checkout.fill_in_records()
+    root = checkout.folder / "results"
+    first = ProcessLock(root / ".work/snakemake.lock", "holds the results")
+    first.acquire(wait=False)
+    second = checkout.start("aggregate", log="second.log")
+    log = checkout.folder / "second.log"
+    wait_until(lambda: "makes the files under results" in log.read_text())
+    assert "train" not in checkout.scheduled()  # a dry run touches nothing and need not wait
+    assert not (root / "summary").exists()
+    first.release()
+    assert second.wait(240) == 0
+    assert log.read_text().startswith(f"waiting for process {os.getpid()} on ")
+    assert (root / "summary/runs.csv").exists()
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_two_snakemakes_at_once_train_every_run_once(checkout: Checkout) -> None:
+    checkout.configure(seeds=[100])
+    both = [checkout.start("aggregate", log=f"{name}.log") for name in ("first", "second")]
+    assert [process.wait(600) for process in both] == [0, 0]
+    logs = [(checkout.folder / f"{name}.log").read_text() for name in ("first", "second")]
+    assert sum(log.startswith("waiting for process") for log in logs) == 1
+    assert sum("Nothing to be done" in log for log in logs) == 1
+    for run in checkout.plan().runs:
+        folder = checkout.folder / "results" / run.path
+        records.verify_record(folder)
+        assert len(json.loads((folder / "provenance.json").read_text())["attempts"]) == 1
+
+
+@pytest.mark.slow
+def test_a_diverging_run_stops_alone(checkout: Checkout) -> None:
+    """The rest of the grid goes on, the failure is not tried again, and the summary names it."""
+    diverging = {"algorithm": "safemr", "policy_lr": 1.0e30, "start_steps": 200}
+    checkout.configure(seeds=[100], algorithms={"Lost": diverging, **GRID["algorithms"]})
+    printed = checkout.snakemake("all", "--keep-going", check=False)
+    recorded = {run.variant for run in checkout.plan().runs
+                if records.is_complete(checkout.folder / "results" / run.path)}  # fmt: skip
+    assert recorded == set(GRID["algorithms"])
+    assert printed.count("error: Lost Pillars-0.15-Goal seed 100: ") == 1
+    (line,) = inspection.unfinished(checkout.folder / "results")
+    assert line.startswith("Lost Pillars-0.15-Goal seed 100")
+    assert "failed: " in line
+
+
+KILLS = {
+    **{number.name: number for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)},
+    "Ctrl-C": -signal.SIGINT,  # to the whole process group, as a terminal does
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", KILLS.values(), ids=KILLS)
 def test_many_kills_of_snakemake(number: int, checkout: Checkout) -> None:
     """Kills at random moments, the orphans included in what may go wrong."""
-    checkout.configure(seeds=[100], budget={"off_policy": 20_000})
-    generator = random.Random(number)
-    for _ in range(6):
-        with open(checkout.folder / "killed.log", "ab") as log:
-            process = subprocess.Popen(
-                checkout.command("all"), cwd=checkout.folder, stdout=log, stderr=log
-            )
-        time.sleep(generator.uniform(3.0, 25.0))
-        process.send_signal(number)
-        process.wait(240)
-    checkout.snakemake("all")
+    checkout.configure(seeds=[100], budget={"off_policy": 10_000})
+    generator, begun = random.Random(number), time.monotonic()
+    checkout.scheduled()
+    unit = time.monotonic() - begun  # how long Snakemake needs to begin, on this machine now
+    kills = 0
+    while kills < 6:
+        process = checkout.start("aggregate", log="killed.log")
+        try:
+            assert process.wait(generator.uniform(0.5, 4.0) * unit) == 0
+            break  # it was faster than the kills
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, -number) if number < 0 else process.send_signal(number)
+            process.wait(1200)
+            kills += 1
+    assert kills > 0
+    checkout.snakemake("aggregate")
     for run in checkout.plan().runs:
         records.verify_record(checkout.folder / "results" / run.path)
+    assert not list(checkout.folder.glob("results/.work/*/*"))

@@ -1,4 +1,15 @@
 # Records -> tidy tables. Every record is verified; one that cannot be believed stops the rule.
+
+# What tables and figures are made of: everything, or with allow_missing what is there already.
+RECORDED = [
+    run
+    for run in PLAN.runs
+    if not CONFIG.allow_missing or os.path.exists(f"{RESULTS}/{run.path}/provenance.json")
+]
+if not RECORDED:
+    sys.exit("error: allow_missing is set, but none of the configured runs is recorded yet")
+
+
 rule aggregate:
     input:
         record_files(RECORDED),

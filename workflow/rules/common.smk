@@ -31,14 +31,6 @@ except UserError as error:
 RESULTS, FIGURES = CONFIG.results_root.as_posix(), CONFIG.figures_root.as_posix()
 RUNS = {run.path.as_posix(): run for run in PLAN.runs}
 SUMMARY = f"{RESULTS}/summary"
-# What tables and figures are made of: everything, or with allow_missing what is there already.
-RECORDED = [
-    run
-    for run in PLAN.runs
-    if not CONFIG.allow_missing or os.path.exists(f"{RESULTS}/{run.path}/provenance.json")
-]
-if not RECORDED:
-    sys.exit("error: allow_missing is set, but none of the configured runs is recorded yet")
 LOGS = f"{RESULTS}/logs"
 TARGETS = []  # each rules file adds what `all` must make
 

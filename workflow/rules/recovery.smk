@@ -1,4 +1,5 @@
-# After a SIGKILL or a power failure the next `snakemake` just continues. No rules.
+# After a SIGKILL or a power failure the next `snakemake` just continues, and beside a live one it
+# waits until that is done. No rules.
 #
 # Snakemake leaves two things behind when it is killed: its lock, which nothing but a person would
 # remove, and markers of outputs that were being written, which stop the next start. Both are
@@ -8,6 +9,8 @@ import base64
 import fcntl
 import shutil
 from pathlib import Path
+
+from safemr.locks import ProcessLock
 
 IS_RECORD = re.compile(r"seed\d+-[0-9a-f]{12}").fullmatch
 
@@ -45,6 +48,14 @@ def recover(state):
     fcntl.flock(alive, fcntl.LOCK_SH)
     return alive
 
+
+# One Snakemake at a time makes the files under a results root, from whatever folder it was started:
+# Snakemake's own lock is looked up and written in two steps, and invites to be removed by hand.
+if workflow.is_main_process and not workflow.output_settings.dryrun:
+    ROOT_LOCK = ProcessLock(
+        Path(RESULTS, ".work", "snakemake.lock"), f"makes the files under {RESULTS}"
+    )
+    ROOT_LOCK.acquire(wait=True)
 
 if workflow.is_main_process:
     ALIVE = recover(Path(".snakemake"))

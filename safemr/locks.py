@@ -1,0 +1,76 @@
+"""One process at a time, by an advisory lock that the kernel drops when its owner dies.
+
+There is no stale lock to recognise and no process number to mistake for another's, also after
+SIGKILL, a reboot or in a container. The file's text only says who the owner is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import socket
+import time
+from pathlib import Path
+
+from safemr.errors import UserError, tell
+
+
+class LockedError(UserError):
+    """Another live process holds the lock."""
+
+    exit_code = 3
+
+
+class ProcessLock:
+    """The lock file ``path``; ``work`` is what its owner does, for messages."""
+
+    def __init__(self, path: Path, work: str) -> None:
+        self.path, self._work = path, work
+        self._descriptor: int | None = None
+
+    def acquire(self, *, wait: bool) -> None:
+        """Take the lock; when it is held, wait for its owner to end, or raise LockedError."""
+        announced = False
+        while not self._try():
+            owner = self._owner()
+            if not wait:
+                raise LockedError(f"{owner} {self._work}; wait for it or stop it")
+            if not announced:
+                tell(f"waiting for {owner}, which {self._work}")
+                announced = True
+            time.sleep(0.5)
+
+    def _owner(self) -> str:
+        with contextlib.suppress(OSError):  # the owner may be removing the file right now
+            return self.path.read_text(errors="replace").strip() or "another process"
+        return "another process"
+
+    def _try(self) -> bool:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        except (FileNotFoundError, FileExistsError):
+            if self.path.parent.exists():
+                raise
+            return False  # the owner removed the folder between our two calls
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # The previous owner may have removed the file between our open and our lock.
+            current = os.stat(self.path).st_ino == os.fstat(descriptor).st_ino
+        except (BlockingIOError, FileNotFoundError):
+            current = False
+        if not current:
+            os.close(descriptor)
+            return False
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without its text
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        self._descriptor = descriptor
+        return True
+
+    def release(self) -> None:
+        """Drop the lock; the file may stay."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None

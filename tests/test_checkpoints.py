@@ -1,0 +1,235 @@
+"""Checkpoints hold the whole state, cost little, run no code, and are there when a run stops."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from sample_record import CONFIG, POLICY, ROWS
+
+from safemr import atomic, checkpoints, records
+from safemr.checkpoints import RunSession
+from safemr.errors import UserError
+from safemr.train import Progress
+
+arrays = hnp.arrays(
+    st.sampled_from([np.float64, np.float32, np.int64, np.int32, np.uint64, np.uint8, np.bool_]),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3),
+)
+plain = st.none() | st.booleans() | st.integers(-(2**130), 2**130) | st.floats() | st.text()
+states = st.recursive(
+    plain | arrays,
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text() | st.integers(), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(deadline=None)
+@given(states)
+def test_checkpoints_round_trip(tmp_path_factory: pytest.TempPathFactory, state: Any) -> None:
+    path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.pt"
+    checkpoints.save(path, {"state": state})
+    np.testing.assert_equal(checkpoints.load(path)["state"], state)
+
+
+def test_generator_states_survive(tmp_path: Path) -> None:
+    """NumPy's states hold integers of 128 bits."""
+    generator = np.random.default_rng(7)
+    checkpoints.save(tmp_path / "c.pt", {"rng": generator.bit_generator.state})
+    again = np.random.default_rng(0)
+    again.bit_generator.state = checkpoints.load(tmp_path / "c.pt")["rng"]
+    assert again.random() == generator.random()
+
+
+def test_a_state_that_cannot_be_saved_is_named(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"state\['envs'\]\[1\] is a set"):
+        checkpoints.save(tmp_path / "c.pt", {"envs": [1, {2}]})
+    assert not list(tmp_path.iterdir())
+
+
+class Malicious:
+    """Unpickling this creates a file."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self) -> Any:
+        return (os.mkdir, (str(self.target),))
+
+
+def test_no_file_can_run_code(tmp_path: Path) -> None:
+    target = tmp_path / "hacked"
+    policy, checkpoint = tmp_path / "policy.npz", tmp_path / "checkpoint.pt"
+    np.savez(policy, allow_pickle=True, weights=np.array([Malicious(target)], dtype=object))
+    torch.save({"state": Malicious(target)}, checkpoint)
+    with pytest.raises(UserError, match=r"policy\.npz is not a readable policy"):
+        records.load_policy(policy)
+    with pytest.raises(UserError, match=r"checkpoint\.pt is not a readable checkpoint"):
+        checkpoints.load(checkpoint)
+    policy.write_bytes(pickle.dumps(Malicious(target)))
+    with pytest.raises(UserError):
+        records.load_policy(policy)
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
+def test_a_truncated_checkpoint_starts_the_run_again(
+    keep: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RunSession(CONFIG, "FAC-phih", tmp_path, minimum_interval=0) as session:
+        session.resume()
+        session.record(ROWS[0])
+        session.maybe_checkpoint(lambda: {"x": torch.zeros(1000)})
+    path = session.work / "checkpoint.pt"
+    path.write_bytes(path.read_bytes()[: int(keep * path.stat().st_size)])
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        assert session.resume() is None
+        assert session.rows == []
+    assert "starting again from step 0" in capsys.readouterr().err
+
+
+def test_checkpoints_cost_at_most_two_per_cent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a clock where writing takes 3 s and an interval 1 s."""
+    clock = [0.0]
+    monkeypatch.setattr(checkpoints.time, "monotonic", lambda: clock[0])
+    written = []
+
+    def state() -> dict[str, float]:
+        clock[0] += 3.0
+        written.append(clock[0])
+        return {}
+
+    with RunSession(CONFIG, "FAC-phih", tmp_path, minimum_interval=10) as session:
+        session.resume()
+        for _ in range(3000):
+            clock[0] += 1.0
+            session.maybe_checkpoint(state)
+    assert len(written) >= 15
+    assert 3.0 * len(written) <= 0.02 * clock[0]
+
+
+def test_a_part_of_a_large_tensor_is_saved_as_small_as_it_is(tmp_path: Path) -> None:
+    """torch saves all the memory behind a slice: a replay buffer that is nearly empty, for one."""
+    large = torch.arange(1_000_000.0)
+    checkpoints.save(tmp_path / "c.pt", {"part": large[:10], "columns": large.view(1000, -1)[:2].T})
+    assert (tmp_path / "c.pt").stat().st_size < 20_000
+    again = checkpoints.load(tmp_path / "c.pt")
+    assert again["part"].equal(large[:10])
+    assert again["columns"].equal(large.view(1000, -1)[:2].T)
+
+
+def test_a_finished_run_leaves_only_its_record(tmp_path: Path) -> None:
+    with RunSession(CONFIG, "FAC-phih", tmp_path, minimum_interval=0) as session:
+        session.resume()
+        for row in ROWS:
+            session.record(row)
+            session.maybe_checkpoint(dict)
+        session.finish(POLICY)
+    records.verify_record(session.folder)
+    assert not session.work.exists()
+    provenance = json.loads((session.folder / "provenance.json").read_text())
+    assert {"commit", "dirty", "started", "step"} <= provenance["attempts"][0].keys()
+    assert provenance["peak_rss_mb"] > 10
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as again:
+        assert again.complete
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leads_to_a_checkpoint_and_an_exit(number: int, tmp_path: Path) -> None:
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        session.resume()
+        session.record(ROWS[0])
+        os.kill(os.getpid(), number)
+        with pytest.raises(SystemExit) as caught:
+            session.maybe_checkpoint(lambda: {"x": 1})
+    assert caught.value.code == 128 + number
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        assert session.resume() == {"x": 1}
+
+
+def test_an_orphan_stops_with_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with RunSession(CONFIG, "FAC-phih", tmp_path, die_with_parent=True) as session:
+        session.resume()
+        session.record(ROWS[0])
+        session.maybe_checkpoint(lambda: {"x": 1})  # the parent lives: nothing is due
+        assert not (session.work / "checkpoint.pt").exists()
+        monkeypatch.setattr(os, "getppid", lambda: 1)
+        with pytest.raises(SystemExit):
+            session.maybe_checkpoint(lambda: {"x": 2})
+    assert checkpoints.load(session.work / "checkpoint.pt")["state"] == {"x": 2}
+
+
+def test_a_gone_reader_does_not_stop_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C also reaches the `tee` behind standard error, which then is a broken pipe."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with contextlib.suppress(BrokenPipeError), os.fdopen(writer, "w") as gone:
+        with pytest.raises(BrokenPipeError):
+            print("anybody?", file=gone, flush=True)
+        monkeypatch.setattr(sys, "stderr", gone)
+        with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+            session.resume()
+            os.kill(os.getpid(), signal.SIGINT)
+            session.record(ROWS[0])
+            Progress("run", 20, gone).show({**ROWS[0], "time_steps_per_s": 1.0})
+            with pytest.raises(SystemExit) as caught:
+                session.maybe_checkpoint(lambda: {"x": 1})
+    assert caught.value.code == 128 + signal.SIGINT
+    assert checkpoints.load(session.work / "checkpoint.pt")["state"] == {"x": 1}
+
+
+def test_a_torn_note_of_an_attempt_spoils_only_itself(tmp_path: Path) -> None:
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        session.resume()
+    notes = session.work / checkpoints.ATTEMPTS
+    notes.write_text(notes.read_text()[:30])
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        session.resume()
+        assert [event["step"] for event in checkpoints.read_attempts(session.work)] == [0]
+        session.rows = list(ROWS)
+        session.finish(None)
+    provenance = json.loads((session.folder / "provenance.json").read_text())
+    assert provenance["started"] == provenance["attempts"][0]["started"]
+
+
+def test_a_kill_in_the_middle_of_a_checkpoint(tmp_path: Path) -> None:
+    """What a killed write leaves is removed by the next attempt: two checkpoints at most."""
+    with RunSession(CONFIG, "FAC-phih", tmp_path, minimum_interval=0) as session:
+        session.resume()
+        session.record(ROWS[0])
+        session.maybe_checkpoint(lambda: {"x": torch.zeros(100)})
+    pid = os.fork()
+    if pid == 0:
+        with (
+            RunSession(CONFIG, "FAC-phih", tmp_path),
+            atomic.replacing(session.work / "checkpoint.pt") as stream,
+        ):
+            stream.write(b"half")
+            stream.flush()
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(pid, 0)
+    (leftover,) = session.work.glob("*.tmp")
+    assert leftover.read_bytes() == b"half"
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        state = session.resume()
+        assert state is not None
+        assert state["x"].shape == (100,)
+        assert not list(session.work.glob("*.tmp"))
