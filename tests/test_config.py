@@ -370,9 +370,7 @@ def test_version_bumps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_later_files_replace_whole_sections(tmp_path: Path) -> None:
     overlay = tmp_path / "overlay.yaml"
-    overlay.write_text(
-        "algorithms: {Mine: {algorithm: fac, critic_lr: 1e-3}}\nsensitivity: null\n"
-    )
+    overlay.write_text("algorithms: {Mine: {algorithm: fac, critic_lr: 1e-3}}\nsensitivity: null\n")
     loaded = config.load([DEFAULT, overlay], {"seeds": [7]})
     as_text = config.load([DEFAULT], {"seeds": ["7"], "allow_missing": "true"})
     assert as_text.seeds == (7,)

@@ -9,7 +9,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, TwoSlopeNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
 from numpy.typing import NDArray
 
 from safemr.energy import constraint, energy, largest
@@ -242,7 +243,7 @@ def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
     start = np.array([-0.9, -0.88]) * extent
     end = start + 0.3 * extent * np.array([np.cos(heading), np.sin(heading)])
     ax.annotate("", tuple(end), tuple(start), arrowprops={"arrowstyle": "->", "lw": 1})
-    ax.set(aspect="equal", xticks=[-2, 0, 2], yticks=[-2, 0, 2])
+    ax.set(aspect="equal", xticks=[-2, 0, 2], yticks=[-2, 0, 2], xlabel="$x$ (m)")
     ax.grid(False)
     figure = ax.get_figure()
     assert figure is not None
@@ -257,7 +258,7 @@ def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence
 
     The arrow is the direction of motion at every point; green: the goal; dotted: d_min.
     """
-    figure = style.new_figure(style.TEXT_WIDTH, 2.5)
+    figure = style.new_figure(style.TEXT_WIDTH, 2.8)
     axes = figure.subplots(1, len(names), squeeze=False)[0]
     for ax, name in zip(axes, names, strict=True):
         ax.set_title(name)
@@ -267,6 +268,14 @@ def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence
             ax.text(0.5, 0.5, "no record", transform=ax.transAxes, ha="center", color="0.5")
             ax.set(box_aspect=1, xticks=[], yticks=[])
     axes[0].set_ylabel("$y$ (m)")
+    handles = {
+        r"$\phi = 0$": Line2D([], [], color="#0072B2", lw=1.3),
+        r"$d = d_{\min}$": Line2D([], [], color="k", ls=":", lw=0.8),
+        "obstacle": Patch(fc="0.35", ec="none"),
+        "goal": Line2D([], [], color="#009E73", marker="o", mfc="none", ls="none"),
+        "motion": Line2D([], [], color="k", marker=r"$\rightarrow$", ls="none", ms=8),
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
     return figure
 
 
