@@ -47,6 +47,7 @@ rule training_curves:
     threads: 1
     params:
         **GRID,
+        **BUDGET,
     script:
         "../scripts/training_curves.py"
 
