@@ -20,7 +20,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats.qmc import Sobol
 
 from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
 from safemr.energy import energy, magnitude, scaled
@@ -44,6 +43,8 @@ class Truth:
     @classmethod
     def sample(cls, solution: Solution, log2_count: int = 19) -> Truth:
         """The first 2^log2_count Sobol points: with 2^19, volumes are right to about 0.02 %."""
+        from scipy.stats.qmc import Sobol  # a second, which kept measurements do not need
+
         low, high = np.array([*BOX_LOW, 0.0]), np.array([*BOX_HIGH, 2 * np.pi])
         unit = Sobol(3, scramble=False).random_base2(log2_count)
         states = low + unit * (high - low)
@@ -79,15 +80,6 @@ def energy_certificate(
         return energy(*scaled(d, d_dot, dynamics.d_min, length_scale), sigma, k, n)
 
     return phi
-
-
-def in_metres(zeta: Sequence[float], length_scale: float) -> tuple[float, float, float]:
-    """The zeta in metres with the same unsafe set as ``zeta`` in units of ``length_scale``.
-
-    Multiplying phi by L^n shows it: [sigma, k, n] becomes [L sigma, L^(n-1) k, n].
-    """
-    sigma, k, n = zeta
-    return length_scale * sigma, length_scale ** (n - 1) * k, n
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ does not apply to a row is nan.
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,11 +22,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
-from safemr import aircraft, records, reference, statistics
+from safemr import aircraft, reachability, records, reference, statistics
 from safemr.aircraft import Truth
 from safemr.energy import constraint
 from safemr.errors import UserError
 from safemr.evaluate import Acts
+from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.plotting.aircraft import Slice
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
@@ -78,6 +80,54 @@ class Obedient:
         return self.rates[chosen, None].astype(np.float32)
 
 
+class TrueSets:
+    """The solved values of both cases and samples of the first, each made when first asked for.
+
+    ``solve`` returns the solution of a case; nobody waits for it where all numbers are kept.
+    """
+
+    def __init__(
+        self, solve: Callable[[AircraftDynamics], Solution], log2_states: int = 19
+    ) -> None:
+        self._solve, self.log2_states = solve, log2_states
+
+    @classmethod
+    def cached(cls, folder: Path | str, log2_states: int = 19) -> TrueSets:
+        """From the solutions kept in ``folder`` (`safemr.reachability.load_or_solve`)."""
+        return cls(functools.partial(reachability.load_or_solve, Path(folder)), log2_states)
+
+    @functools.cached_property
+    def constant(self) -> Solution:
+        return self._solve(reachability.CONSTANT)
+
+    @functools.cached_property
+    def adversarial(self) -> Solution:
+        return self._solve(reachability.ADVERSARIAL)
+
+    @functools.cached_property
+    def truth(self) -> Truth:
+        return Truth.sample(self.constant, self.log2_states)
+
+    def starts(self, flights: int) -> Floats:
+        """[N, 3] safe initial states, the same for every policy."""
+        return aircraft.safe_starts(self.constant, flights, STARTS_SEED)
+
+
+def measured_frontier(
+    measurements: Measurements, sets: TrueSets, missed_shares: Sequence[float] = MISSED_SHARES
+) -> pd.DataFrame:
+    """`frontier_table`, kept among ``measurements``."""
+    inputs = {
+        "missed_shares": list(missed_shares), "solver": reachability.VERSION,
+        "log2_states": sets.log2_states,
+    }  # fmt: skip
+    rows = measurements.rows(
+        "aircraft_frontier", "frontier", inputs,
+        lambda: frontier_table(sets.truth, missed_shares).to_dict("records"),
+    )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
 def frontier_table(truth: Truth, missed_shares: Sequence[float] = MISSED_SHARES) -> pd.DataFrame:
     """missed_share, volume_ratio, sigma, k, n (metres): the best members of the energy family."""
     points = aircraft.frontier(truth, missed_shares)
@@ -86,9 +136,7 @@ def frontier_table(truth: Truth, missed_shares: Sequence[float] = MISSED_SHARES)
 
 
 def compare(
-    truth: Truth,
-    solution: Solution,
-    adversarial: Solution,
+    sets: TrueSets,
     frontier: pd.DataFrame,
     root: Path,
     runs: pd.DataFrame,
@@ -96,38 +144,58 @@ def compare(
 ) -> pd.DataFrame:
     """The comparison of recorded runs (rows of `records.read_records`'s index) and references.
 
-    Raises UserError naming every record whose policy file does not say what its certificate is.
+    What is measured is kept among the measurements under ``root``. Raises UserError naming every
+    record whose policy file does not say what its certificate is.
     """
-    starts = aircraft.safe_starts(solution, flights, STARTS_SEED)
-    rows = [
-        {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
-        | _certificate(truth, **saved)
-        | flights_of(policy, starts, truth)
-        for run, saved, policy in learners(root, runs)
-    ]
-    rows += [
-        {"kind": "certificate", "variant": name, "seed": -1}
-        | _certificate(truth, zeta, length_scale=1.0, eta=0.0)
-        | flights_of(_obeying(truth, zeta), starts, truth)
-        for name, zeta in CERTIFICATES.items()
-    ]
-    wider = adversarial(truth.states) <= 0
-    rows += [
-        {"kind": "certificate", "variant": ADVERSARIAL_SET, "seed": -1}
-        | {"volume_ratio": float(wider.sum() / truth.unsafe.sum()), "missed_share": 0.0}
-        | {"iou": float((wider & truth.unsafe).sum() / (wider | truth.unsafe).sum())},
-        {"kind": "policy", "variant": TRUE_SET, "seed": -1}
-        | {"volume_ratio": 1.0, "missed_share": 0.0, "iou": 1.0}
-        | flights_of(aircraft.OptimalEvader(solution), starts, truth),
-        {"kind": "policy", "variant": STRAIGHT, "seed": -1}
-        | flights_of(_Straight(), starts, truth),
-    ]
+    measurements = Measurements(root)
+    shared = {"flights": flights, "starts_seed": STARTS_SEED, "log2_states": sets.log2_states,
+              "solver": reachability.VERSION}  # fmt: skip
+    rows = []
+    for run, saved in learners(root, runs):
+
+        def measure(saved: Saved = saved) -> dict[str, float]:
+            own = _certificate(sets.truth, saved.zeta, saved.length_scale, saved.eta)
+            return own | flights_of(saved.policy(), sets.starts(flights), sets.truth)
+
+        label = record_label(saved.folder)
+        inputs = {**shared, "policy": record_inputs(root / str(run.folder))}
+        rows.append(
+            {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
+            | measurements.rows("aircraft_learners", label, inputs, measure)
+        )
+    inputs = {**shared, "certificates": {name: list(zeta) for name, zeta in CERTIFICATES.items()}}
+    rows += measurements.rows(
+        "aircraft_references", "references", inputs, lambda: _references(sets, flights)
+    )
     table = pd.DataFrame(rows)
     table["covers"] = table["missed_share"] <= aircraft.COVERS
     table["least_volume_ratio"] = np.interp(
         table["missed_share"], frontier["missed_share"], frontier["volume_ratio"]
     )
     return table
+
+
+def _references(sets: TrueSets, flights: int) -> list[dict[str, Any]]:
+    """The rows of what is held against the learners."""
+    truth, starts = sets.truth, sets.starts(flights)
+    rows: list[dict[str, Any]] = [
+        {"kind": "certificate", "variant": name, "seed": -1}
+        | _certificate(truth, zeta, length_scale=1.0, eta=0.0)
+        | flights_of(_obeying(truth, zeta), starts, truth)
+        for name, zeta in CERTIFICATES.items()
+    ]
+    wider = sets.adversarial(truth.states) <= 0
+    rows += [
+        {"kind": "certificate", "variant": ADVERSARIAL_SET, "seed": -1}
+        | {"volume_ratio": float(wider.sum() / truth.unsafe.sum()), "missed_share": 0.0}
+        | {"iou": float((wider & truth.unsafe).sum() / (wider | truth.unsafe).sum())},
+        {"kind": "policy", "variant": TRUE_SET, "seed": -1}
+        | {"volume_ratio": 1.0, "missed_share": 0.0, "iou": 1.0}
+        | flights_of(aircraft.OptimalEvader(sets.constant), starts, truth),
+        {"kind": "policy", "variant": STRAIGHT, "seed": -1}
+        | flights_of(_Straight(), starts, truth),
+    ]
+    return rows
 
 
 def as_scores(comparison: pd.DataFrame, task: str = "Aircraft") -> pd.DataFrame:
@@ -156,18 +224,32 @@ def plane(spacing: float) -> tuple[Floats, Floats]:
 
 
 def slices(
-    solution: Solution,
-    adversarial: Solution,
+    sets: TrueSets,
     comparison: pd.DataFrame,
+    measurements: Measurements,
     degrees: Sequence[float] = (0, 60, 120, 180, 240, 300),
     spacing: float = 0.1,
 ) -> tuple[Floats, Floats, list[Slice]]:
     """x [X], y [Y] over the box where encounters start, and all unsafe sets at each psi.
 
-    The learned ones are those whose zeta is trained; every set contains the disc.
+    The learned ones are those whose zeta is trained; every set contains the disc. The solved values
+    are kept among ``measurements``.
     """
-    dynamics = solution.dynamics
+    dynamics = reachability.CONSTANT
     x, y = plane(spacing)
+    planes = [
+        np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
+        for psi in np.radians(degrees)
+    ]
+    solved = measurements.arrays(
+        "aircraft_slices",
+        "slices",
+        {"degrees": list(degrees), "spacing": spacing, "solver": reachability.VERSION},
+        lambda: {
+            name: np.stack([solution(states) for states in planes]).astype(np.float32)
+            for name, solution in (("truth", sets.constant), ("adversarial", sets.adversarial))
+        },
+    )
     zetas = {
         str(variant): learned_zetas(comparison, str(variant))
         for variant in comparison["variant"].unique()
@@ -179,19 +261,18 @@ def slices(
         return np.maximum(phi, dynamics.d_min - dynamics.separation(states))
 
     cuts = []
-    for psi in np.radians(degrees):
-        states = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
+    for index, states in enumerate(planes):
         cuts.append(
             Slice(
-                psi=float(psi),
-                truth=solution(states),
+                psi=float(states[0, 0, 2]),
+                truth=solved["truth"][index],
                 handcrafted=claimed(states, reference.PHI_H, 1.0),
                 learned={
                     variant: [claimed(states, *learned) for learned in found]
                     for variant, found in zetas.items()
                     if found
                 },
-                adversarial=adversarial(states),
+                adversarial=solved["adversarial"][index],
             )
         )
     return x, y, cuts
@@ -280,32 +361,46 @@ def _cell(values: pd.Series, factor: float, digits: int) -> str:
     return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
 
 
+@dataclass(frozen=True)
+class Saved:
+    """What a record says of its certificate."""
+
+    folder: Path
+    zeta: Floats  # [3] in units of length_scale
+    length_scale: float  # [m]
+    eta: float
+
+    def policy(self) -> Policy:
+        from safemr.policies import load_policy  # torch, which kept measurements do not need
+
+        return load_policy(self.folder)
+
+
 def learners(
     root: Path, runs: pd.DataFrame, needed: Sequence[str] = ("zeta", "length_scale")
-) -> Sequence[tuple[Any, dict[str, Any], Policy]]:
-    """(run, zeta with length_scale and eta, policy) of every record.
+) -> Sequence[tuple[Any, Saved]]:
+    """(run, what is saved of its certificate) of every record.
 
     Raises UserError naming every record whose policy file lacks an array of ``needed``.
     """
-    from safemr.policies import load_policy  # torch, which reading a comparison does not need
-
     found, lacking = [], []
     for run in runs.itertuples():
         folder = root / str(run.folder)
         if not (folder / records.POLICY).is_file():
             lacking.append(str(run.folder))
             continue
-        policy = load_policy(folder)
-        if not set(needed) <= policy.extras.keys():
+        arrays = records.load_policy(folder / records.POLICY)
+        if not set(needed) <= arrays.keys():
             lacking.append(str(run.folder))
             continue
         config = json.loads((folder / records.CONFIG).read_text())
-        saved = {
-            "zeta": policy.extras["zeta"].astype(float),
-            "length_scale": float(policy.extras["length_scale"]),
-            "eta": float(config["algorithm"]["hyperparameters"]["eta"]),
-        }
-        found.append((run, saved, policy))
+        saved = Saved(
+            folder=folder,
+            zeta=arrays["zeta"].astype(float),
+            length_scale=float(arrays["length_scale"]),
+            eta=float(config["algorithm"]["hyperparameters"]["eta"]),
+        )
+        found.append((run, saved))
     if lacking:
         raise UserError(
             f"no {records.POLICY} with {' and '.join(needed)} in {', '.join(lacking)}: remove "

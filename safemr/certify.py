@@ -21,10 +21,13 @@ import numpy as np
 import pandas as pd
 
 from safemr import falsification, reference
+from safemr.energy import in_metres
 from safemr.errors import UserError
 from safemr.feasibility import BRAKINGS, CONVENTIONS, analytic_condition
+from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.records import CONFIG, POLICY, PROGRESS, PROVENANCE, parse_progress, verify_record
 from safemr.reference import Zeta
+from safemr.runs import describe_task
 from safemr.tables import Table
 
 if TYPE_CHECKING:
@@ -62,9 +65,6 @@ def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any
     The last logged sigma, k and n; `policy` is None where the record has none (it is optional).
     Raises UserError where there is no record, or none of the energy-function family.
     """
-    # Imported here for numba, which parameters alone do not need.
-    from safemr.aircraft import in_metres
-
     verify_record(folder)
     config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     last = parse_progress((folder / PROGRESS).read_text(encoding="utf-8"))[-1]
@@ -121,6 +121,52 @@ def certify(
             "policy_avoidable_share": check.avoidable_share,
         }
     return row, search
+
+
+def measured_certificate(
+    measurements: Measurements,
+    certificate: Certificate,
+    task: str,
+    *,
+    states: int,
+    episodes: int,
+    settings: Mapping[str, Any],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The row of `certify` and the example of its search, kept among ``measurements``."""
+    inputs = {
+        "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
+        "task": describe_task(task, settings),
+        "states": states, "episodes": episodes,
+        "policy": certificate.policy and record_inputs(certificate.policy),
+    }  # fmt: skip
+
+    def measure() -> dict[str, Any]:
+        row, search = certify(
+            certificate, task, states=states, episodes=episodes, settings=settings
+        )
+        return {"row": row, "example": search.example()}
+
+    kept = measurements.rows("certificates", _label(certificate, task), inputs, measure)
+    return kept["row"], kept["example"]
+
+
+def measured_margins(
+    measurements: Measurements, certificate: Certificate, task: str
+) -> tuple[pd.DataFrame, float]:
+    """`margin_map` of a certificate, and the task's d_min, kept among ``measurements``."""
+    inputs = {
+        "zeta": list(certificate.zeta), "eta": certificate.eta,
+        "task": describe_task(task, {}),
+    }  # fmt: skip
+
+    def measure() -> dict[str, Any]:
+        margins = margin_map(task, certificate.zeta, eta=certificate.eta)
+        columns = {name: margins[name].to_numpy() for name in margins}
+        return columns | {"d_min": np.array(_d_min(task))}
+
+    kept = dict(measurements.arrays("margins", _label(certificate, task), inputs, measure))
+    d_min = float(kept.pop("d_min"))
+    return pd.DataFrame(kept), d_min
 
 
 def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
@@ -194,17 +240,12 @@ def margin_map(
     return pd.DataFrame({"distance": places[:, 0], "bearing": places[:, 1], "margin": margin})
 
 
-def picture(jobs: Sequence[tuple[Certificate, str, Mapping[str, Any]]]) -> Figure:
-    """The analytic condition of certificates of one task, and the margins of the last of them."""
+def picture(certificates: Sequence[Certificate], margins: pd.DataFrame, d_min: float) -> Figure:
+    """The analytic condition of certificates of one task, and ``margins`` of the last of them."""
     from safemr.plotting import certificate as drawing
 
-    mapped, task, _ = jobs[-1]
-    envs = falsification.make_simulator(task, 1)
-    d_min = float(envs.d_min)
-    envs.close()
-    zetas = {job[0].name: job[0].zeta for job in jobs}
-    margins = margin_map(task, mapped.zeta, eta=mapped.eta)
-    return drawing.certificate_check(zetas, d_min, margins, mapped.name)
+    zetas = {certificate.name: certificate.zeta for certificate in certificates}
+    return drawing.certificate_check(zetas, d_min, margins, certificates[-1].name)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -260,7 +301,10 @@ def _write(
     examples = {job[0].name: search.example() for job, search in zip(jobs, searches, strict=True)}
     text = json.dumps(examples, indent=1, sort_keys=True) + "\n"
     (folder / "examples.json").write_text(text, encoding="utf-8")
-    style.save(picture([job for job in jobs if job[1] == jobs[0][1]]), folder / "certificates")
+    task = jobs[0][1]
+    pictured = [job[0] for job in jobs if job[1] == task]
+    margins = margin_map(task, pictured[-1].zeta, eta=pictured[-1].eta)
+    style.save(picture(pictured, margins, _d_min(task)), folder / "certificates")
 
 
 def _replay(path: Path) -> int:
@@ -296,6 +340,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="write table, picture, examples")
     parser.add_argument("--replay", type=Path, metavar="FILE", help="replay examples.json")
     return parser
+
+
+def _label(certificate: Certificate, task: str) -> str:
+    if certificate.policy is not None:
+        return record_label(certificate.policy)
+    return f"{certificate.name} {task}"
+
+
+def _d_min(task: str) -> float:
+    envs = falsification.make_simulator(task, 1)
+    d_min = float(envs.d_min)
+    envs.close()
+    return d_min
 
 
 def _column(convention: str, braking: str) -> str:

@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 
 from safemr import reference
 from safemr.evaluate import evaluate
+from safemr.measurements import Measurements
 from safemr.point_robot import PointRobot
+from safemr.runs import describe_task
 
 Array = NDArray[np.float64]
 
 ROBOT = PointRobot()
+SCORE_COLUMNS = ["task", "variant", "seed", "metric", "value"]
 CRUISE = 1.0  # m/s on the way
 PUSH_SPEED = 0.5  # m/s while pushing; faster loses the box
 TOUCH = 0.52  # m from the box's centre, where the nose all but meets its corner
@@ -148,7 +151,31 @@ def controller_scores(
                 scores = evaluate(controller(envs), envs, 1_000_000 + seed * episodes)
                 rows += [(task, name, seed, f"eval_{key}", value) for key, value in scores.items()]
             envs.close()
-    return pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+    return pd.DataFrame(rows, columns=SCORE_COLUMNS)
+
+
+def measured_scores(
+    measurements: Measurements,
+    tasks: Sequence[str],
+    *,
+    seeds: int,
+    episodes: int,
+    settings: Mapping[str, Mapping[str, Any]],
+) -> pd.DataFrame:
+    """`controller_scores` for seeds 0 to ``seeds`` - 1, kept task by task."""
+    rows: list[dict[str, Any]] = []
+    for task in tasks:
+        described = describe_task(task, settings.get(task, {}))
+        inputs = {"task": described, "seeds": seeds, "episodes": episodes}
+
+        def measure(task: str = task) -> Any:
+            scores = controller_scores(
+                (task,), seeds=range(seeds), episodes=episodes, settings=settings
+            )
+            return scores.to_dict("records")
+
+        rows += measurements.rows("controllers", task, inputs, measure)
+    return pd.DataFrame(rows, columns=SCORE_COLUMNS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

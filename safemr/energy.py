@@ -10,6 +10,7 @@ in units of ``length_scale`` divides d, d_dot and d_min by it first (`scaled`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,15 @@ def magnitude(d_min: Array, sigma: Array, k: Array, n: Array, a: float, b: float
 def scaled(d: Array, d_dot: Array, d_min: Array, length_scale: float) -> tuple[Array, Array, Array]:
     """(d, d_dot, d_min) in units of ``length_scale`` [m]; seconds stay seconds."""
     return d / length_scale, d_dot / length_scale, d_min / length_scale
+
+
+def in_metres(zeta: Sequence[float], length_scale: float) -> tuple[float, float, float]:
+    """The zeta in metres with the same unsafe set as ``zeta`` in units of ``length_scale``.
+
+    Multiplying phi by L^n shows it: [sigma, k, n] becomes [L sigma, L^(n-1) k, n].
+    """
+    sigma, k, n = zeta
+    return length_scale * sigma, length_scale ** (n - 1) * k, n
 
 
 def softplus(x: Array) -> Array:

@@ -23,7 +23,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from safemr.energy import constraint, energy, largest
 from safemr.errors import UserError
@@ -128,6 +127,8 @@ def falsify(
     smaller steps than the last, and keeps what is worse. Raises UserError where phi stays positive
     far from the obstacle, so that the box of states has no end.
     """
+    from scipy.stats import qmc  # a second, which kept measurements do not need
+
     d_min = float(envs.d_min)
     bounds = np.array(
         [(d_min, largest_distance(zeta, d_min)), (-np.pi, np.pi), (-np.pi, np.pi),

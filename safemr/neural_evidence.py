@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.aircraft import AircraftDynamics, AircraftVectorEnv, observe
-from safemr import aircraft, aircraft_evidence, reference
+from safemr import aircraft, aircraft_evidence, reachability, reference
 from safemr.aircraft import Certificate, Truth
+from safemr.aircraft_evidence import TrueSets
 from safemr.algorithms.neural_safemr import neural_energy
+from safemr.measurements import VERSIONS, Measurements, record_inputs
 from safemr.networks import StackedMLP
 from safemr.observation import ObservationTransform
 from safemr.plotting.aircraft import Slice
+from safemr.plotting.data import below
 from safemr.policies import Policy, network_from_arrays
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
@@ -33,6 +36,7 @@ from safemr.tables import Table, describe_missing
 CONTROL = "fit to the truth"
 CONTROL_SHARES = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 ARRAYS = ("zeta", "length_scale", "smoothing", "certificate_parameters")  # in a policy file
+SLICE, SPACING = 180.0, 0.1  # [degree], [m] of the plane that is drawn
 LOG2_STATES = 17  # Sobol points of the comparison: volumes are right to 0.1 %
 _CHUNK = 2**16  # states evaluated at once, which bounds the memory
 
@@ -91,8 +95,9 @@ def recorded_certificates(
 ) -> dict[str, list[Certificate]]:
     """Variant -> its certificates by seed, of the rows of `records.read_records`'s index."""
     found: dict[str, list[Certificate]] = {}
-    for run, _, policy in aircraft_evidence.learners(root, runs.sort_values("seed"), ARRAYS):
-        found.setdefault(str(run.variant), []).append(recorded_certificate(dynamics, policy))
+    for run, saved in aircraft_evidence.learners(root, runs.sort_values("seed"), ARRAYS):
+        certificate = recorded_certificate(dynamics, saved.policy())
+        found.setdefault(str(run.variant), []).append(certificate)
     return found
 
 
@@ -186,9 +191,12 @@ def compare(
 
     rows: list[dict[str, Any]] = [
         {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
-        | measured(recorded_certificate(dynamics, policy), saved["eta"])
+        | measured(recorded_certificate(dynamics, policy), saved.eta)
         | aircraft_evidence.flights_of(policy, starts, truth)
-        for run, saved, policy in aircraft_evidence.learners(root, runs, ARRAYS)
+        for run, saved, policy in (
+            (run, saved, saved.policy())
+            for run, saved in aircraft_evidence.learners(root, runs, ARRAYS)
+        )
     ]
     covering = shifted_to_miss(truth, control, aircraft.COVERS)
     rows += [
@@ -212,6 +220,42 @@ def compare(
     return table.reindex(columns=table.columns.union(["collision_share", "effort"], sort=False))
 
 
+def measured(
+    measurements: Measurements,
+    sets: TrueSets,
+    frontier: pd.DataFrame,
+    root: Path,
+    runs: pd.DataFrame,
+    energy: Mapping[str, Any],
+) -> tuple[pd.DataFrame, Floats, Floats, Slice]:
+    """`compare`, with a control of the hyperparameters ``energy``, and `slice_at` for one seed of
+    each variant; both kept among ``measurements``."""
+    inputs: dict[str, Any] = {
+        "policies": [record_inputs(root / str(folder)) for folder in sorted(runs["folder"])],
+        "energy": settings_of(energy), "log2_states": sets.log2_states,
+        "flights": aircraft_evidence.FLIGHTS, "solver": reachability.VERSION,
+        "frontier": VERSIONS["aircraft_frontier"],
+    }  # fmt: skip
+
+    def rows() -> Any:
+        control = fit_to_truth(sets.truth, **inputs["energy"])
+        table = compare(sets.truth, sets.constant, frontier, root, runs, control)
+        return table.to_dict("records")
+
+    def arrays() -> dict[str, NDArray[Any]]:
+        certificates = recorded_certificates(sets.truth.dynamics, root, runs)
+        shown = {variant: found[:1] for variant, found in certificates.items()}
+        _, _, cut = slice_at(sets.constant, shown)
+        learned = {f"learned/{name}": found[0] for name, found in cut.learned.items()}
+        return {"truth": cut.truth, "handcrafted": cut.handcrafted, **learned}
+
+    comparison = pd.DataFrame(measurements.rows("aircraft_neural", "neural", inputs, rows))
+    kept = measurements.arrays("aircraft_neural_slice", "neural", inputs, arrays)
+    learned = {name: [values] for name, values in below(kept, "learned/").items()}
+    cut = Slice(float(np.radians(SLICE)), kept["truth"], kept["handcrafted"], learned)
+    return comparison, *aircraft_evidence.plane(SPACING), cut
+
+
 def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame) -> Table:
     """Learners (mean and 95% t interval over seeds), then the control."""
     shown = comparison[comparison["kind"] != "control"]
@@ -232,8 +276,8 @@ def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame) -> Table:
 def slice_at(
     solution: Solution,
     learned: Mapping[str, Sequence[Certificate]],
-    degrees: float = 180.0,
-    spacing: float = 0.1,
+    degrees: float = SLICE,
+    spacing: float = SPACING,
 ) -> tuple[Floats, Floats, Slice]:
     """x [X], y [Y] and the unsafe sets of certificates (the disc included) at one psi."""
     x, y = aircraft_evidence.plane(spacing)

@@ -8,19 +8,23 @@ positions. `safemr.plotting.data` writes and reads them; the figures of `safemr.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from safemr.energy import energy, largest
 from safemr.errors import UserError
 from safemr.evaluate import Acts
 from safemr.falsification import make_simulator
+from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.plotting.data import GEOMETRY, Arrays
-from safemr.policies import Policy, network_from_arrays
 from safemr.reference import Zeta
+from safemr.runs import describe_task
+
+if TYPE_CHECKING:
+    from safemr.certify import Certificate
+    from safemr.policies import Policy
 
 TOUCHED = 1e-5  # m off the free path: a contact
 
@@ -73,6 +77,10 @@ def multipliers(policy: Policy, observations: NDArray[Any]) -> NDArray[np.float6
     """
     if "multiplier_parameters" not in policy.extras:
         raise UserError("this policy was recorded without a multiplier network")
+    import torch  # seconds, which kept measurements do not need
+
+    from safemr.policies import network_from_arrays
+
     network = network_from_arrays("multiplier", policy.extras)
     with torch.no_grad():
         raw = network(torch.from_numpy(policy.transform(observations)))[0, :, 0]
@@ -128,6 +136,42 @@ def multiplier_map(
         "obstacles": scene.obstacles, "goal": scene.goal,
         "speed": np.array(speed), "heading": np.array(heading), **geometry,
     }  # fmt: skip
+
+
+def measured(
+    measurements: Measurements,
+    certificate: Certificate,
+    task: str,
+    *,
+    layouts: list[int],
+    steps: int,
+    settings: Mapping[str, Any],
+) -> Arrays:
+    """`episodes` and `multiplier_map` (of the first layout) of a certificate's recorded policy.
+
+    Their arrays under "episodes/" and "map/", kept among ``measurements``.
+    """
+    assert certificate.policy is not None
+    inputs = {
+        "policy": record_inputs(certificate.policy), "zeta": list(certificate.zeta),
+        "task": describe_task(task, settings),
+        "layouts": layouts, "steps": steps,
+    }  # fmt: skip
+
+    def measure() -> Arrays:
+        from safemr.policies import load_policy
+
+        assert certificate.policy is not None
+        policy = load_policy(certificate.policy)
+        parts = {
+            "episodes": episodes(policy, task, seeds=layouts, steps=steps, settings=settings),
+            "map": multiplier_map(
+                policy, certificate.zeta, task, seed=layouts[0], settings=settings
+            ),
+        }
+        return {f"{part}/{name}": x for part, made in parts.items() for name, x in made.items()}
+
+    return measurements.arrays("rollouts", record_label(certificate.policy), inputs, measure)
 
 
 def _pose(values: NDArray[Any] | None) -> NDArray[Any]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy import stats
+from scipy.special import stdtrit
 
 from safemr.errors import UserError
 
@@ -55,7 +55,7 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> Estimate:
     mean = float(sample.mean())
     if count == 1:
         return Estimate(mean, np.nan, np.nan, 1)
-    half = float(stats.t.ppf((1 + level) / 2, count - 1) * sample.std(ddof=1) / np.sqrt(count))
+    half = float(stdtrit(count - 1, (1 + level) / 2) * sample.std(ddof=1) / np.sqrt(count))
     return Estimate(mean, mean - half, mean + half, count)
 
 
@@ -359,7 +359,7 @@ def _welch_t(x: np.ndarray, y: np.ndarray, ratio: float, level: float) -> float:
     if v1 + v2 == 0:
         return 0.0
     freedom = (v1 + v2) ** 2 / (v1**2 / (len(x) - 1) + v2**2 / (len(y) - 1))
-    return float(stats.t.ppf((1 + level) / 2, freedom))
+    return float(stdtrit(freedom, (1 + level) / 2))
 
 
 def _resample(

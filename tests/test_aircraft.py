@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import envs  # noqa: F401  registers the environments
 from envs.aircraft import AircraftDynamics, AircraftEnv, AircraftVectorEnv, outside_box
 from safemr import aircraft
+from safemr.energy import in_metres
 from safemr.reachability import CONSTANT, Grid, Solution, solve
 
 DYNAMICS = AircraftDynamics()
@@ -371,9 +372,7 @@ def test_zeta_in_other_length_units_means_the_same_set(
 ):
     states = np.random.default_rng(0).uniform([-6, -10, 0], [20, 10, 6.28], (500, 3))
     scaled = aircraft.energy_certificate(CONSTANT, (sigma, k, n), length)(states)
-    metres = aircraft.energy_certificate(CONSTANT, aircraft.in_metres((sigma, k, n), length))(
-        states
-    )
+    metres = aircraft.energy_certificate(CONSTANT, in_metres((sigma, k, n), length))(states)
     np.testing.assert_allclose(scaled * length**n, metres, rtol=1e-9, atol=1e-9)
 
 

@@ -14,7 +14,10 @@ from matplotlib.colors import to_hex
 
 from envs.aircraft import AircraftVectorEnv
 from safemr import aircraft, aircraft_evidence, config, records, runs, statistics
+from safemr.aircraft_evidence import TrueSets
+from safemr.energy import in_metres
 from safemr.errors import UserError
+from safemr.measurements import Measurements
 from safemr.networks import StackedMLP
 from safemr.observation import ObservationTransform
 from safemr.plotting import aircraft as pictures
@@ -43,8 +46,13 @@ def solutions() -> tuple[Solution, Solution]:
 
 
 @pytest.fixture(scope="module")
-def truth(solutions: tuple[Solution, Solution]) -> aircraft.Truth:
-    return aircraft.Truth.sample(solutions[0], log2_count=13)
+def sets(solutions: tuple[Solution, Solution]) -> TrueSets:
+    return TrueSets(dict(zip((CONSTANT, ADVERSARIAL), solutions, strict=True)).__getitem__, 13)
+
+
+@pytest.fixture(scope="module")
+def truth(sets: TrueSets) -> aircraft.Truth:
+    return sets.truth
 
 
 def turning(rate: float, **extras: Any) -> dict[str, np.ndarray]:
@@ -80,12 +88,8 @@ def index(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]
 
 
 @pytest.fixture(scope="module")
-def comparison(
-    truth: aircraft.Truth,
-    solutions: tuple[Solution, Solution],
-    index: tuple[Path, pd.DataFrame],
-) -> pd.DataFrame:
-    return aircraft_evidence.compare(truth, *solutions, FRONTIER, *index, flights=200)
+def comparison(sets: TrueSets, index: tuple[Path, pd.DataFrame]) -> pd.DataFrame:
+    return aircraft_evidence.compare(sets, FRONTIER, *index, flights=200)
 
 
 def test_every_run_and_every_reference_has_a_row(comparison: pd.DataFrame) -> None:
@@ -104,7 +108,7 @@ def test_a_record_in_other_units_is_the_same_certificate(comparison: pd.DataFram
     """FAC-phih in units of five metres against the handcrafted one in metres."""
     rows = comparison.set_index("variant")
     np.testing.assert_allclose(
-        aircraft.in_metres(rows.loc["FAC-phih", ["sigma", "k", "n"]].astype(float), 5.0),
+        in_metres(rows.loc["FAC-phih", ["sigma", "k", "n"]].astype(float), 5.0),
         rows.loc["phi_h", ["sigma", "k", "n"]].astype(float),
         rtol=1e-6,
     )
@@ -112,9 +116,7 @@ def test_a_record_in_other_units_is_the_same_certificate(comparison: pd.DataFram
         assert rows.loc["FAC-phih", metric] == pytest.approx(rows.loc["phi_h", metric], abs=1e-3)
 
 
-def test_rows_hold_what_the_measures_say(
-    comparison: pd.DataFrame, truth: aircraft.Truth, solutions: tuple[Solution, Solution]
-) -> None:
+def test_rows_hold_what_the_measures_say(comparison: pd.DataFrame, truth: aircraft.Truth) -> None:
     row = comparison[(comparison["variant"] == "JointSIS") & (comparison["seed"] == 101)].iloc[0]
     phi = aircraft.energy_certificate(CONSTANT, np.float32(ZETAS["JointSIS", 101]).tolist(), 5.0)
     expected = aircraft.compare_certificate(truth, phi, eta=0.01)
@@ -171,11 +173,9 @@ def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
         assert "SafeMR" in path.read_text()
 
 
-def test_without_any_run_the_references_remain(
-    truth: aircraft.Truth, solutions: tuple[Solution, Solution], tmp_path: Path
-) -> None:
+def test_without_any_run_the_references_remain(sets: TrueSets, tmp_path: Path) -> None:
     none = pd.DataFrame(columns=["task", "variant", "seed", "folder"])
-    comparison = aircraft_evidence.compare(truth, *solutions, FRONTIER, tmp_path, none, flights=20)
+    comparison = aircraft_evidence.compare(sets, FRONTIER, tmp_path, none, flights=20)
     table = aircraft_evidence.comparison_table(comparison, none)
     assert table.notes == ()
     assert set(aircraft_evidence.CERTIFICATES) <= set(table.display["certificate"])
@@ -183,13 +183,13 @@ def test_without_any_run_the_references_remain(
 
 
 def test_records_that_do_not_say_their_certificate_are_all_named(
-    truth: aircraft.Truth, solutions: tuple[Solution, Solution], tmp_path: Path
+    sets: TrueSets, tmp_path: Path
 ) -> None:
     write(tmp_path, "Silent", 100, None)
     write(tmp_path, "Baseline", 101, turning(0.1))
     index = records.read_records(tmp_path)[0]
     with pytest.raises(UserError, match=r"zeta.*Baseline/seed101.*Silent/seed100"):
-        aircraft_evidence.compare(truth, *solutions, FRONTIER, tmp_path, index, flights=20)
+        aircraft_evidence.compare(sets, FRONTIER, tmp_path, index, flights=20)
 
 
 def test_frontier_table_is_the_frontier(truth: aircraft.Truth) -> None:
@@ -243,9 +243,11 @@ def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
 
 
 def test_slices_hold_the_sets_of_the_comparison(
-    comparison: pd.DataFrame, solutions: tuple[Solution, Solution]
+    comparison: pd.DataFrame, sets: TrueSets, tmp_path: Path
 ) -> None:
-    x, y, (cut,) = aircraft_evidence.slices(*solutions, comparison, degrees=[180], spacing=0.5)
+    x, y, (cut,) = aircraft_evidence.slices(
+        sets, comparison, Measurements(tmp_path), degrees=[180], spacing=0.5
+    )
     assert set(cut.learned) == {"SafeMR", "JointSIS"}
     assert len(cut.learned["SafeMR"]) == 2
     inside = np.hypot(*np.meshgrid(x, y, indexing="ij")) < CONSTANT.d_min
@@ -264,7 +266,7 @@ def test_shipped_learners_start_alike_and_mean_the_papers_certificates(name: str
     for run in plan.aircraft:
         values = run.config["algorithm"]["hyperparameters"]
         zeta = [values[parameter] for parameter in ("sigma", "k", "n")]
-        zetas[run.variant] = aircraft.in_metres(zeta, values["length_scale"])
+        zetas[run.variant] = in_metres(zeta, values["length_scale"])
         assert values["target_entropy"] == -1.0
     certificates = aircraft_evidence.CERTIFICATES
     assert zetas["FAC-phih"] == pytest.approx(certificates["phi_h"])

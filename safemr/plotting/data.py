@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safemr import atomic
 from safemr.errors import UserError
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -32,9 +35,9 @@ def scene_at(data: Arrays, episode: int, step: int) -> SimpleNamespace:
 
 
 def save(path: Path | str, arrays: Arrays) -> None:
-    """Write a compressed `.npz` without pickled objects."""
+    """Write a compressed `.npz` without pickled objects; it appears whole or not at all."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "wb") as stream:
+    with atomic.replacing(Path(path), durable=False) as stream:
         np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 
@@ -43,7 +46,7 @@ def load(path: Path | str) -> Arrays:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is not readable rollout data: {error}") from error
 
 

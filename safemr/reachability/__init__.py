@@ -3,6 +3,23 @@
 from __future__ import annotations
 
 from safemr.reachability.grid import Grid
-from safemr.reachability.solver import ADVERSARIAL, CASES, CONSTANT, Solution, load_or_solve, solve
+from safemr.reachability.solver import (
+    ADVERSARIAL,
+    CASES,
+    CONSTANT,
+    VERSION,
+    Solution,
+    load_or_solve,
+    solve,
+)
 
-__all__ = ["ADVERSARIAL", "CASES", "CONSTANT", "Grid", "Solution", "load_or_solve", "solve"]
+__all__ = [
+    "ADVERSARIAL",
+    "CASES",
+    "CONSTANT",
+    "VERSION",
+    "Grid",
+    "Solution",
+    "load_or_solve",
+    "solve",
+]

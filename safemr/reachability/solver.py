@@ -21,6 +21,8 @@ import hashlib
 import json
 import os
 import time
+import zipfile
+import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -124,7 +126,7 @@ def load_or_solve(
                 stored["changes"],
                 float(stored["seconds"]),
             )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"cached solution {path} cannot be used ({error}): delete it") from error
 
 

@@ -16,6 +16,7 @@ rule aircraft_frontier:
         f"{LOGS}/aircraft_frontier.log",
     threads: 1
     params:
+        root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
     message:
         "Solving the aircraft's true unsafe sets and the frontier of the energy family"
@@ -63,6 +64,7 @@ rule aircraft_figures:
         f"{LOGS}/aircraft_figures.log",
     threads: 1
     params:
+        root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
     script:
         "../scripts/aircraft_figures.py"

@@ -22,6 +22,7 @@ rule controllers:
         f"{LOGS}/controllers.log",
     threads: 1
     params:
+        root=RESULTS,
         tasks=ROBOT_TASKS,
         settings=SETTINGS,
         seeds=min(5, CONFIG.evaluation.episodes),

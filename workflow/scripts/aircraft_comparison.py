@@ -4,23 +4,17 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import aircraft_evidence, reachability, records, statistics
-from safemr.aircraft import Truth
+from safemr import aircraft_evidence, records, statistics
 from safemr.cli import reported_errors
 
 params, output = snakemake.params, snakemake.output
-constant, adversarial = (
-    reachability.load_or_solve(Path(params.cache), case)
-    for case in (reachability.CONSTANT, reachability.ADVERSARIAL)
-)
 frontier = pd.read_csv(snakemake.input.frontier)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 with reported_errors():
     runs, _ = records.read_records(Path(params.root), params.folders)
     runs = runs.reindex(columns=runs.columns.union(expected.columns))
-    comparison = aircraft_evidence.compare(
-        Truth.sample(constant), constant, adversarial, frontier, Path(params.root), runs
-    )
+    sets = aircraft_evidence.TrueSets.cached(params.cache)
+    comparison = aircraft_evidence.compare(sets, frontier, Path(params.root), runs)
 comparison.to_csv(output.comparison, index=False)
 aircraft_evidence.as_scores(comparison).to_csv(output.scores, index=False)
 missing = statistics.missing_runs(expected, runs)

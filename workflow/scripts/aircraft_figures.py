@@ -7,18 +7,20 @@ import pandas as pd
 
 from safemr import aircraft_evidence, reachability
 from safemr.aircraft import COVERS
+from safemr.cli import reported_errors
+from safemr.measurements import Measurements
 from safemr.plotting import aircraft, style
 
 PAPER = ("SafeMR", "JointSIS")  # the learners of the paper's picture
 
-constant, adversarial = (
-    reachability.load_or_solve(Path(snakemake.params.cache), case)
-    for case in (reachability.CONSTANT, reachability.ADVERSARIAL)
-)
+params = snakemake.params
 comparison = pd.read_csv(snakemake.input.comparison)
 frontier = pd.read_csv(snakemake.input.frontier)
-x, y, cuts = aircraft_evidence.slices(constant, adversarial, comparison)
-d_min = constant.dynamics.d_min
+with reported_errors():
+    x, y, cuts = aircraft_evidence.slices(
+        aircraft_evidence.TrueSets.cached(params.cache), comparison, Measurements(params.root)
+    )
+d_min = reachability.CONSTANT.d_min
 head_on = cuts[3]
 learned = {name: head_on.learned[name] for name in PAPER if name in head_on.learned}
 figures = (

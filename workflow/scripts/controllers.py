@@ -2,12 +2,14 @@
 
 from safemr import controllers
 from safemr.cli import reported_errors
+from safemr.measurements import Measurements
 
 params = snakemake.params
 with reported_errors():
-    scores = controllers.controller_scores(
+    scores = controllers.measured_scores(
+        Measurements(params.root),
         params.tasks,
-        seeds=range(params.seeds),
+        seeds=params.seeds,
         episodes=params.episodes,
         settings=params.settings,
     )

@@ -1,0 +1,160 @@
+"""What is kept of measurements: found again exactly, measured anew when anything changes."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sample_record import make_record
+
+from safemr import aircraft_evidence, certify, controllers, measurements
+from safemr.errors import UserError
+from safemr.measurements import Measurements, record_inputs
+
+ROOT = Path(__file__).resolve().parents[1]
+KIND = "controllers"
+
+
+class Counting:
+    """A measurement that says how often it was made."""
+
+    def __init__(self, value):
+        self.value, self.calls = value, 0
+
+    def __call__(self):
+        self.calls += 1
+        return self.value
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Measurements:
+    return Measurements(tmp_path)
+
+
+def test_rows_are_measured_once_and_come_back_exactly(kept: Measurements) -> None:
+    rows = [{"third": 1 / 3, "none": math.nan, "count": 7, "name": "a"}]
+    measure = Counting(rows)
+    first = kept.rows(KIND, "one", {"seed": 1}, measure)
+    second = kept.rows(KIND, "one", {"seed": 1}, measure)
+    assert measure.calls == 1
+    for found in (first, second):
+        assert math.isnan(found[0].pop("none"))
+        assert found == [{"third": 1 / 3, "count": 7, "name": "a"}]
+
+
+def test_arrays_are_measured_once_and_come_back_exactly(kept: Measurements) -> None:
+    measure = Counting({"x": np.linspace(0, 1, 7), "flag": np.array(True)})
+    first = kept.arrays("margins", "one", {}, measure)
+    second = kept.arrays("margins", "one", {}, measure)
+    assert measure.calls == 1
+    assert first.keys() == second.keys() == {"x", "flag"}
+    np.testing.assert_array_equal(second["x"], measure.value["x"])
+    assert second["flag"].dtype == bool
+
+
+def test_other_inputs_or_another_version_replace_what_was_kept(
+    kept: Measurements, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = Counting(0)
+    kept.rows(KIND, "other", {"seed": 1}, other)
+    measure = Counting(1)
+    for seed in (1, 2, 2):
+        kept.rows(KIND, "one", {"seed": seed}, measure)
+    assert measure.calls == 2
+    monkeypatch.setitem(measurements.VERSIONS, KIND, measurements.VERSIONS[KIND] + 1)
+    kept.rows(KIND, "one", {"seed": 2}, measure)
+    assert measure.calls == 3
+    names = sorted(path.name[:-18] for path in (kept.folder / KIND).iterdir())
+    assert names == ["one", "other"], "what is superseded is removed, other labels are not"
+
+
+@pytest.mark.parametrize("damage", ["truncated", "tampered", "empty"])
+def test_a_damaged_file_is_named_and_never_believed(kept: Measurements, damage: str) -> None:
+    kept.rows(KIND, "one", {}, lambda: [{"return": 1.5}])
+    (path,) = (kept.folder / KIND).iterdir()
+    text = path.read_text()
+    changed = {"truncated": text[:-20], "tampered": text.replace("1.5", "9.5"), "empty": ""}
+    path.write_text(changed[damage])
+    with pytest.raises(UserError, match=r"controllers/one-[0-9a-f]{12}\.json is damaged.*delete"):
+        kept.rows(KIND, "one", {}, lambda: [])
+    assert path.read_text() == changed[damage]
+
+
+def test_damaged_arrays_are_named(kept: Measurements) -> None:
+    kept.arrays("margins", "one", {}, lambda: {"x": np.zeros(1000)})
+    (path,) = (kept.folder / "margins").iterdir()
+    path.write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(UserError, match=r"margins/one-[0-9a-f]{12}\.npz is damaged.*delete"):
+        kept.arrays("margins", "one", {}, dict)
+
+
+def test_a_failed_measurement_keeps_nothing(kept: Measurements) -> None:
+    def fails() -> None:
+        raise UserError("no")
+
+    with pytest.raises(UserError):
+        kept.rows(KIND, "one", {}, fails)
+    assert not (kept.folder / KIND).exists()
+
+
+def test_a_record_is_identified_by_its_content(tmp_path: Path) -> None:
+    folder = make_record(tmp_path)
+    inputs = record_inputs(folder)
+    assert inputs["record"].endswith(folder.name)
+    provenance = json.loads((folder / "provenance.json").read_text())
+    assert inputs["files"] == provenance["files"]
+    (folder / "progress.csv").write_text("step\n1\n")
+    with pytest.raises(UserError, match="checksum"):
+        record_inputs(folder)
+
+
+def stored(kind: str, label: str) -> list[dict]:
+    """What the repository keeps under a label."""
+    paths = (ROOT / "results" / measurements.FOLDER / kind).glob(f"{label}-*.json")
+    return [json.loads(path.read_text()) for path in paths]
+
+
+def close(now: object, before: object) -> bool:
+    """Equal but for round-off, at any depth."""
+    if isinstance(before, dict):
+        return now.keys() == before.keys() and all(close(now[k], before[k]) for k in before)
+    if isinstance(before, list):
+        return len(now) == len(before) and all(map(close, now, before))
+    if isinstance(before, float):
+        return now == pytest.approx(before, rel=1e-6, abs=1e-9, nan_ok=True)
+    return now == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["controllers", "certificates", "aircraft_frontier"])
+def test_the_repository_keeps_what_its_code_measures(
+    kind: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Otherwise VERSIONS was not raised with a change of the measuring code."""
+    label = {"controllers": "Pillars-0.15-Goal", "certificates": "phi_h-Pillars-0.15-Goal",
+             "aircraft_frontier": "frontier"}[kind]  # fmt: skip
+    (entry,) = stored(kind, label)
+    assert entry["version"] == measurements.VERSIONS[kind]
+    inputs, kept = entry["inputs"], Measurements(tmp_path)
+    if kind == "controllers":
+        task = inputs["task"]
+        controllers.measured_scores(
+            kept, [task["name"]], seeds=inputs["seeds"], episodes=inputs["episodes"],
+            settings={task["name"]: task["settings"]},
+        )  # fmt: skip
+    elif kind == "certificates":
+        (certificate,) = (c for c in certify.paper_certificates() if c.name == inputs["name"])
+        certify.measured_certificate(
+            kept, certificate, inputs["task"]["name"], states=inputs["states"],
+            episodes=inputs["episodes"], settings={},
+        )  # fmt: skip
+    else:
+        cache = tmp_path_factory.mktemp("solved")
+        aircraft_evidence.measured_frontier(kept, aircraft_evidence.TrueSets.cached(cache))
+    (path,) = (kept.folder / kind).iterdir()
+    now = json.loads(path.read_text())
+    assert now["inputs"] == inputs, "the inputs are the same, so the key must be"
+    assert close(now["value"], entry["value"]), f"raise VERSIONS[{kind!r}] and redraw"
