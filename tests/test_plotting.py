@@ -80,6 +80,38 @@ def test_wide_intervals_do_not_flatten_the_curves():
     assert 10 <= high < 17
 
 
+def variations(names: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Learning curves and minutes of variants on one task."""
+    rows = [
+        {"task": TASKS[0], "variant": name, "step": step, "mean": float(index), "low": float(index),
+         "high": float(index)}
+        for index, name in enumerate(names)
+        for step in (100, 200)
+    ]  # fmt: skip
+    returns = pd.DataFrame(rows)
+    return returns, returns[["task", "variant", "step"]].assign(minutes=returns["step"] / 100)
+
+
+def test_many_variants_of_one_task_are_told_apart():
+    names = ["SafeMR", *(f"SafeMR-{i}" for i in range(6)), "PPO-L", "PPO-L-1", "CPO"]
+    figure = curves.compute_curves(*variations(names), TASKS[:1])
+    assert [ax.get_title().split(", ")[1] for ax in figure.axes] == ["SafeMR", "PPO-L", "CPO"]
+    for ax, members in zip(figure.axes, (names[:7], names[7:9], names[9:]), strict=True):
+        assert [text.get_text() for text in ax.get_legend().get_texts()] == members
+        looks = {(line.get_color(), line.get_linestyle()) for line in ax.lines}
+        assert len(looks) == len(ax.lines) == len(members)
+
+
+def test_a_legend_of_long_names_stays_inside_the_figure():
+    names = [f"a variant with a long name {i}" for i in range(8)]
+    figure = curves.compute_curves(*variations(names), TASKS[:1])
+    figure.canvas.draw()
+    box, (legend,) = figure.bbox, figure.legends
+    extent = legend.get_window_extent()
+    assert extent.x0 >= box.x0
+    assert extent.x1 <= box.x1
+
+
 def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
     returns = statistics.learning_curves(progress, "eval_return")
     costs = statistics.learning_curves(progress, "eval_cost")

@@ -88,17 +88,32 @@ def compute_curves(
 ) -> Figure:
     """Expected return against processor minutes, evaluations included, one panel a task.
 
+    More than eight variants of one task get one panel for each algorithm that they vary.
     returns: `statistics.learning_curves`; minutes: `statistics.core_minutes` of the same runs.
     """
     timed = returns.merge(minutes, on=["task", "variant", "step"])
-    figure = style.new_figure(style.TEXT_WIDTH, 2.1)
-    axes = figure.subplots(1, len(tasks), squeeze=False)[0]
-    for ax, task in zip(axes, tasks, strict=True):
-        _task_panel(timed.drop(columns="step").rename(columns={"minutes": "step"}), task, ax)
-        ax.set_title(task)
+    timed = timed.drop(columns="step").rename(columns={"minutes": "step"})
+    variants = style.ordered(returns["variant"].unique())
+    crowded = len(tasks) == 1 and len(variants) > 8
+    figure = style.new_figure(style.TEXT_WIDTH, 2.9 if crowded else 2.1)
+    if crowded:
+        groups = _by_base(variants)
+        axes = figure.subplots(1, len(groups), squeeze=False)[0]
+        for ax, (base, members) in zip(axes, groups.items(), strict=True):
+            looks = {name: style.member_look(index) for index, name in enumerate(members)}
+            draw_curves(timed[timed["variant"].isin(members)], ax, looks=looks)
+            ax.set_title(f"{tasks[0]}, {style.label(base)}")
+            handles = [Line2D([], [], color=looks[v][0], ls=looks[v][1], label=v) for v in members]
+            ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
+    else:
+        axes = figure.subplots(1, len(tasks), squeeze=False)[0]
+        for ax, task in zip(axes, tasks, strict=True):
+            _task_panel(timed, task, ax)
+            ax.set_title(task)
+        _legend(figure, variants)
+    for ax in axes:
         ax.set_xlabel("core-minutes")
     axes[0].set_ylabel(f"expected {name}")
-    _legend(figure, style.ordered(returns["variant"].unique()))
     return figure
 
 
@@ -212,6 +227,15 @@ def certificate_paths(
     return figure
 
 
+def _by_base(variants: Sequence[str]) -> dict[str, list[str]]:
+    """Variants by the one whose name theirs extends; what extends none is alone."""
+    groups: dict[str, list[str]] = {}
+    for name in sorted(variants, key=len):
+        base = next((base for base in groups if name.startswith(f"{base}-")), name)
+        groups.setdefault(base, []).append(name)
+    return {base: style.ordered(groups[base]) for base in style.ordered(groups)}
+
+
 def _task_panel(table: pd.DataFrame, task: str, ax: Axes) -> None:
     chosen = table[table["task"] == task]
     if chosen.empty:
@@ -239,4 +263,7 @@ def _legend(figure: Figure, variants: Sequence[str]) -> None:
         Line2D([], [], color=style.colour(v), ls=style.line_style(v), label=style.label(v))
         for v in variants
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 8))
+    # As many columns as the longest name leaves room for: what does not fit would be cut off.
+    longest = max((len(v) for v in variants), default=1)
+    columns = max(1, min(len(handles), 8, 96 // (longest + 5)))
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)

@@ -81,6 +81,13 @@ def line_style(variant: str) -> Any:
     return known[1] if known else (0, (4, 1.2, 1, 1.2))
 
 
+def member_look(index: int) -> tuple[str, Any]:
+    """Colour and line of the members of a group that is drawn alone: the first solid and dark."""
+    if index == 0:
+        return ("#000000", _SOLID)
+    return (_OTHERS[(index - 1) % len(_OTHERS)], (_DASHED, _DOTTED, _SOLID)[(index - 1) % 3])
+
+
 def marker(variant: str) -> str:
     """Matplotlib marker of the variant (unknown names: a thin diamond)."""
     known = _ALGORITHMS.get(variant)
