@@ -172,8 +172,11 @@ class _Encounters:
         collided = self.dynamics.separation(self.states) < self.dynamics.d_min
         for key in ("cost", "cost_indicator", "cost_contact"):
             info[key] = collided.astype(float)
-        over = outside_box(self.states) | (self.steps >= AircraftEnv.max_episode_steps)
-        return -np.square(a), collided, over & ~collided, info
+        # Outside the box nothing is at stake: flying straight on costs nothing, so the value is 0.
+        # A bootstrap there would come from states that no transition starts in.
+        ended = collided | outside_box(self.states)
+        over = self.steps >= AircraftEnv.max_episode_steps
+        return -np.square(a), ended, over & ~ended, info
 
     def info(self) -> dict[str, NDArray[Any]]:
         """Info [N] or [N, 1] of the present states, with no cost: that belongs to a step."""
@@ -193,7 +196,7 @@ class _Aircraft:
     d_min = AircraftDynamics.d_min
     num_obstacles = 1
     max_episode_steps = 200
-    task_version = 1
+    task_version = 2  # 1: leaving the box truncated
     observation_layout: ClassVar[dict[str, slice]] = {
         "position": slice(0, 2),
         "heading": slice(2, 4),
@@ -216,9 +219,10 @@ class AircraftEnv(_Aircraft, gymnasium.Env[Floats, NDArray[np.float32]]):
     """One encounter.
 
     Action: the evader's turn rate [rad/s], clipped to [-1, 1]. Observation: [x, y, cos psi,
-    sin psi]. Reward -a^2; cost 1 in collision. A collision terminates; leaving the box
-    x [-6, 20], y [-10, 10] and 200 steps truncate. ``reset(options={"state": [x, y, psi]})``
-    chooses the start. Raises ValueError for actions that are not finite or not of shape (1,).
+    sin psi]. Reward -a^2; cost 1 in collision. A collision terminates, as does leaving the box
+    x [-6, 20], y [-10, 10], where no effort is needed any more; 200 steps truncate.
+    ``reset(options={"state": [x, y, psi]})`` chooses the start. Raises ValueError for actions that
+    are not finite or not of shape (1,).
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012

@@ -285,7 +285,7 @@ def fly(policy: Acts, starts: Floats, dynamics: AircraftDynamics) -> Flights:
         least[running] = np.minimum(least, d)[running]
         effort[running] -= rewards[running]
         steps[running] += 1
-        collided |= running & terminated
+        collided |= running & (d < dynamics.d_min)
         running &= ~(terminated | truncated)
     envs.close()
     return Flights(collided, effort, steps, least)

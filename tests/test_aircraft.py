@@ -151,7 +151,7 @@ def test_actions_are_clipped_before_the_flow():
     ("state", "action", "steps", "terminated", "cost"),
     [
         ([5.5, 0.0, np.pi], 0.0, 1, True, 1.0),  # closing head-on at 10 m/s
-        ([-5.9, 0.0, np.pi / 2], 0.0, 1, False, 0.0),  # leaves through the back
+        ([-5.9, 0.0, np.pi / 2], 0.0, 1, True, 0.0),  # leaves through the back
         ([5.5, 0.0, 0.0], 1.0, 200, False, 0.0),  # in parallel flight the separation rests
     ],
 )
