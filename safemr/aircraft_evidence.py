@@ -31,6 +31,7 @@ from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.plotting.aircraft import Slice
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
+from safemr.runs import describe_task
 from safemr.tables import ABSENT, Table, describe_missing
 
 if TYPE_CHECKING:
@@ -148,8 +149,10 @@ def compare(
     record whose policy file does not say what its certificate is.
     """
     measurements = Measurements(root)
-    shared = {"flights": flights, "starts_seed": STARTS_SEED, "log2_states": sets.log2_states,
-              "solver": reachability.VERSION}  # fmt: skip
+    shared = {
+        "task": describe_task("Aircraft", {}), "flights": flights, "starts_seed": STARTS_SEED,
+        "log2_states": sets.log2_states, "solver": reachability.VERSION,
+    }  # fmt: skip
     rows = []
     for run, saved in learners(root, runs):
 

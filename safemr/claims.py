@@ -108,21 +108,18 @@ def zero_violations(evidence: Evidence) -> Finding:
     Confirmed if it is 1 in every seed (none observed; not a proof); refuted if its interval ends
     below 1 or its mean is below the safety rule's share; else open.
     """
-    absent = evidence.missing([(task, reference.METHOD) for task in evidence.tasks])
-    if absent:
-        return unavailable(absent)
-    parts = {}
-    for task in evidence.tasks:
+
+    def judge(task: str) -> Finding:
         shares = evidence.of(task, reference.METHOD, evidence.rule.clean)
         estimate = statistics.mean_interval(shares)
         shown = f"clean share {describe(estimate)}"
         if (shares == 1).all():
-            parts[task] = Finding(estimate, "confirmed", f"{shown}, no violation observed")
-        elif estimate.high < 1 or estimate.mean < evidence.rule.clean_share:
-            parts[task] = Finding(estimate, "refuted", shown)
-        else:
-            parts[task] = Finding(estimate, "inconclusive", f"{shown}: near one, not one")
-    return overall(parts)
+            return Finding(estimate, "confirmed", f"{shown}, no violation observed")
+        if estimate.high < 1 or estimate.mean < evidence.rule.clean_share:
+            return Finding(estimate, "refuted", shown)
+        return Finding(estimate, "inconclusive", f"{shown}: near one, not one")
+
+    return _on_every_task(evidence, [reference.METHOD], judge)
 
 
 def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
@@ -131,21 +128,19 @@ def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
     Confirmed on a task if the interval of its violating steps lies above the tolerance or that of
     its clean share below the rule's; refuted if it is safe by the rule; else open.
     """
-    absent = evidence.missing([(task, variant) for task in evidence.tasks])
-    if absent:
-        return unavailable(absent)
-    rule, parts = evidence.rule, {}
-    for task in evidence.tasks:
+    rule = evidence.rule
+
+    def judge(task: str) -> Finding:
         cost = statistics.mean_interval(evidence.of(task, variant, rule.cost))
         clean = statistics.mean_interval(evidence.of(task, variant, rule.clean))
         shown = f"{describe(cost)} violating steps, clean share {describe(clean)}"
         if rule.is_safe(evidence.scores, task, variant):
-            parts[task] = Finding(cost, "refuted", f"{shown}: safe")
-        elif cost.low > rule.tolerance or clean.high < rule.clean_share:
-            parts[task] = Finding(cost, "confirmed", shown)
-        else:
-            parts[task] = Finding(cost, "inconclusive", f"{shown}: unsafe on average only")
-    return overall(parts)
+            return Finding(cost, "refuted", f"{shown}: safe")
+        if cost.low > rule.tolerance or clean.high < rule.clean_share:
+            return Finding(cost, "confirmed", shown)
+        return Finding(cost, "inconclusive", f"{shown}: unsafe on average only")
+
+    return _on_every_task(evidence, [variant], judge)
 
 
 def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding:
@@ -155,24 +150,18 @@ def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding
     tasks where the baseline is safe, at least one.
     """
     names = (reference.METHOD, variant)
-    absent = evidence.missing([(task, name) for task in evidence.tasks for name in names])
-    if absent:
-        return unavailable(absent)
-    parts = {}
-    for task in evidence.tasks:
+
+    def judge(task: str) -> Finding | None:
         if not evidence.rule.is_safe(evidence.scores, task, variant):
-            if not somewhere:
-                cost = statistics.mean_interval(evidence.of(task, variant, evidence.rule.cost))
-                parts[task] = Finding(
-                    cost, "refuted", f"{variant} is not safe: {describe(cost)} steps"
-                )
-            continue
+            if somewhere:
+                return None
+            cost = statistics.mean_interval(evidence.of(task, variant, evidence.rule.cost))
+            return Finding(cost, "refuted", f"{variant} is not safe: {describe(cost)} steps")
         returns = [evidence.of(task, name, "eval_return") for name in names]
         gap = statistics.difference_interval(returns[0], returns[1])
-        parts[task] = by_interval(gap, 0.0, f"SafeMR - {variant}")
-    if not parts:
-        return Finding(NOTHING, "refuted", f"{variant} is safe on no task")
-    return overall(parts)
+        return by_interval(gap, 0.0, f"SafeMR - {variant}")
+
+    return _on_every_task(evidence, names, judge, otherwise=f"{variant} is safe on no task")
 
 
 # --- the points [a, b] ---------------------------------------------------------------------------
@@ -418,6 +407,25 @@ def claims_table(evidence: Evidence) -> Table:
         f"seeds were run (docs/claims.md). {str(evidence.rule).capitalize()}."
     )
     return Table("claims", caption, data, display)
+
+
+def _on_every_task(
+    evidence: Evidence,
+    variants: Sequence[str],
+    judge: Callable[[str], Finding | None],
+    otherwise: str = "",
+) -> Finding:
+    """`overall` of the tasks; one on which runs of these variants are missing is open.
+
+    So what has been run cannot confirm what the paper says of every task, but can refute it. A task
+    that ``judge`` leaves out (None) has no part; ``otherwise`` refutes where all are left out.
+    """
+    absent = {task: evidence.missing([(task, v) for v in variants]) for task in evidence.tasks}
+    if all(absent.values()):
+        return unavailable("; ".join(absent.values()))
+    found = {task: unavailable(what) if what else judge(task) for task, what in absent.items()}
+    parts = {task: finding for task, finding in found.items() if finding is not None}
+    return overall(parts) if parts else Finding(NOTHING, "refuted", otherwise)
 
 
 def _missing_points(evidence: Evidence, variants: Sequence[str]) -> str:

@@ -90,7 +90,8 @@ class Measurements:
         value = json.loads(json.dumps(measure()))  # what a reader of the file gets
         content = {**header, "sha256": _digest(value), "value": value}
         path.parent.mkdir(parents=True, exist_ok=True)
-        atomic.write(path, (json.dumps(content, indent=1, sort_keys=True) + "\n").encode())
+        # Not sorted: a table's columns keep their order.
+        atomic.write(path, (json.dumps(content, indent=1) + "\n").encode())
         self._supersede(path)
         return value
 

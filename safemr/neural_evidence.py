@@ -31,6 +31,7 @@ from safemr.plotting.data import below
 from safemr.policies import Policy, network_from_arrays
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
+from safemr.runs import describe_task
 from safemr.tables import Table, describe_missing
 
 CONTROL = "fit to the truth"
@@ -231,6 +232,7 @@ def measured(
     """`compare`, with a control of the hyperparameters ``energy``, and `slice_at` for one seed of
     each variant; both kept among ``measurements``."""
     inputs: dict[str, Any] = {
+        "task": describe_task("Aircraft", {}),
         "policies": [record_inputs(root / str(folder)) for folder in sorted(runs["folder"])],
         "energy": settings_of(energy), "log2_states": sets.log2_states,
         "flights": aircraft_evidence.FLIGHTS, "solver": reachability.VERSION,

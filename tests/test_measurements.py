@@ -41,6 +41,7 @@ def test_rows_are_measured_once_and_come_back_exactly(kept: Measurements) -> Non
     second = kept.rows(KIND, "one", {"seed": 1}, measure)
     assert measure.calls == 1
     for found in (first, second):
+        assert list(found[0]) == list(rows[0]), "a table's columns keep their order"
         assert math.isnan(found[0].pop("none"))
         assert found == [{"third": 1 / 3, "count": 7, "name": "a"}]
 

@@ -254,6 +254,19 @@ def test_one_missing_seed_makes_a_claim_inconclusive_and_is_named(scores):
     assert finding.reason == "runs missing: CPO on Pillars-0.15-Goal (seed 3)"
 
 
+def test_one_task_can_refute_but_not_confirm_what_is_said_of_all(scores):
+    both = (TASK, "Hazards-0.30-Push")  # no run on the second
+    given = evidence(with_baselines(scores), tasks=both)
+    assert verdict("zero_violations", replace(given, tasks=(TASK,))) == "confirmed"
+    (claim,) = [claim for claim in claims.claims(both) if claim.name == "zero_violations"]
+    finding = claim.judge(given)
+    assert finding.verdict == "inconclusive"
+    assert "runs missing: SafeMR on Hazards-0.30-Push (all)" in finding.reason
+    assert f"{TASK}: confirmed" in finding.reason
+    safe = scores.replace({"variant": {"FAC-phih": "CPO", "CPO": "FAC-phih"}})
+    assert verdict("unsafe[CPO]", evidence(safe, tasks=both)) == "refuted"
+
+
 def test_points_must_all_beat_joint_sis(scores):
     labels = {"SafeMR": (0.35, 0.15), "SafeMR[0.45,0.15]": (0.45, 0.15),
               "SafeMR[0.35,0.25]": (0.35, 0.25)}  # fmt: skip

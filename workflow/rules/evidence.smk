@@ -81,7 +81,6 @@ rule claims:
     threads: 1
     params:
         **BUDGET,
-        tasks=list(CONFIG.tasks),
         expected=expected((*PLAN.navigation, *PLAN.sensitivity, *PLAN.outside)),
         points={label: list(point) for label, point in PLAN.points.items()},
         tolerance=CONFIG.cost_tolerance,

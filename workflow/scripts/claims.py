@@ -16,6 +16,5 @@ evidence = Evidence(
     aircraft=pd.read_csv(given.aircraft) if given.aircraft else None,
     certificates=pd.read_csv(given.certificates),
     rule=tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share),
-    tasks=params.tasks,
 )
 claims.claims_table(evidence).write(Path(snakemake.output.markdown).parent)
