@@ -113,6 +113,11 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def row_width(panels: int, least: float) -> float:
+    """Width in inches of a row of square panels: the text's for four, and at least ``least``."""
+    return min(TEXT_WIDTH, max(least, TEXT_WIDTH * panels / 4))
+
+
 def thousands(ax: Axes) -> None:
     """Label the x axis in thousands or millions of environment steps."""
     million = ax.get_xlim()[1] >= 2e6
