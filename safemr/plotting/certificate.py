@@ -258,7 +258,7 @@ def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence
 
     The arrow is the direction of motion at every point; green: the goal; dotted: d_min.
     """
-    figure = style.new_figure(style.row_width(len(names), 4.2), 2.8)
+    figure = style.new_figure(style.row_width(len(names)), 2.8)
     axes = figure.subplots(1, len(names), squeeze=False)[0]
     for ax, name in zip(axes, names, strict=True):
         ax.set_title(name)

@@ -113,9 +113,9 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def row_width(panels: int, least: float) -> float:
-    """Width in inches of a row of square panels: the text's for four, and at least ``least``."""
-    return min(TEXT_WIDTH, max(least, TEXT_WIDTH * panels / 4))
+def row_width(panels: int) -> float:
+    """Width in inches, of those that a page has, of a row of square panels."""
+    return (COLUMN_WIDTH, 0.8 * TEXT_WIDTH, TEXT_WIDTH)[min(panels, 3) - 1]
 
 
 def thousands(ax: Axes) -> None:
