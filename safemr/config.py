@@ -64,6 +64,12 @@ class Sensitivity:
     points: tuple[tuple[float, float], ...]
     seeds: tuple[int, ...]
 
+    @property
+    def is_map(self) -> bool:
+        """Whether the points are all pairs of three or more a and three or more b."""
+        a, b = ({point[i] for point in self.points} for i in (0, 1))
+        return min(len(a), len(b)) >= 3 and len(self.points) == len(a) * len(b)
+
 
 @dataclass(frozen=True)
 class Aircraft:

@@ -149,20 +149,20 @@ def table_one(
     data = pd.DataFrame(rows)
     lines: dict[str, list[str]] = {
         "SafeMR": [
-            _plus_minus(r["safemr"], r["safemr_low"], r["safemr_high"], 2)
+            plus_minus(r["safemr"], r["safemr_low"], r["safemr_high"], 2)
             + ("" if r["safemr_safe"] in (True, None) else " (not safe)")
             for r in rows
         ],
         "Highest among safe baselines": [
-            _plus_minus(r["baseline_return"], r["baseline_low"], r["baseline_high"], 2)
+            plus_minus(r["baseline_return"], r["baseline_low"], r["baseline_high"], 2)
             + (f" ({r['baseline']})" if r["baseline"] else "")
             for r in rows
         ],
         "Improvement [95% interval]": [
             _percent(r["improvement"], r["improvement_low"], r["improvement_high"]) for r in rows
         ],
-        "Paper: SafeMR": [_number(r["paper_safemr"], 3) for r in rows],
-        "Paper: highest among safe": [_number(r["paper_baseline"], 3) for r in rows],
+        "Paper: SafeMR": [number(r["paper_safemr"], 3) for r in rows],
+        "Paper: highest among safe": [number(r["paper_baseline"], 3) for r in rows],
         "Paper: improvement, printed": [f"{r['paper_printed']:.1f}%" for r in rows],
         "Paper: improvement, recomputed": [f"{r['paper_recomputed']:.1f}%" for r in rows],
     }
@@ -175,7 +175,7 @@ def table_one(
         f"improvement with Fieller's 95% interval. {str(rule).capitalize()}. The best baseline is "
         "chosen on the runs it is compared with."
     )
-    return Table("table1", caption, data, display, _notes(missing, tasks, None))
+    return Table("table1", caption, data, display, missing_notes(missing, tasks, None))
 
 
 def full_results(
@@ -209,7 +209,7 @@ def full_results(
         f"counts the robot's nose too. {str(rule).capitalize()}. Scripted controllers see the full "
         "state and are not learned."
     )
-    return Table(name, caption, data, display, _notes(missing, None, None))
+    return Table(name, caption, data, display, missing_notes(missing, None, None))
 
 
 def push_split(scores: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
@@ -224,43 +224,6 @@ def push_split(scores: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> 
         "pushing."
     )
     return Table(table.name, caption, table.data, table.display, table.notes)
-
-
-def table_two(
-    final: pd.DataFrame,
-    points: Mapping[str, tuple[float, float]],
-    *,
-    missing: pd.DataFrame | None = None,
-    task: str = reference.SENSITIVITY_TASK,
-) -> Table:
-    """Table II: learned [sigma, k, n] for each [a, b], per seed and mean, beside the paper's.
-
-    final: score table with the last values of sigma, k, n (`statistics.last_values`).
-    points: variant -> (a, b).
-    """
-    rows = []
-    for variant, (a, b) in points.items():
-        zeta = {name: _by_seed(final, task, variant, name) for name in ("sigma", "k", "n")}
-        for seed in sorted(set().union(*(values.index for values in zeta.values()))):
-            rows.append([a, b, variant, str(seed), *(zeta[name][seed] for name in zeta)])
-        means = [statistics.mean_interval(values.to_numpy(float)) for values in zeta.values()]
-        rows.append([a, b, variant, "mean", *(m.mean for m in means)])
-        rows.append([a, b, variant, "half width", *(m.half_width for m in means)])
-        if (a, b) in reference.TABLE_II:
-            rows.append([a, b, variant, "paper", *reference.TABLE_II[(a, b)]])
-    data = pd.DataFrame(rows, columns=["a", "b", "variant", "seed", "sigma", "k", "n"])
-    display = pd.DataFrame(
-        {
-            "[a, b]": [f"[{a:g}, {b:g}]" for a, b in zip(data["a"], data["b"], strict=True)],
-            "seed": data["seed"],
-            **{name: [_number(value, 3) for value in data[name]] for name in ("sigma", "k", "n")},
-        }
-    )
-    caption = (
-        f"Table II. Learned energy-function parameters on {task} for each [a, b]: last value of "
-        "each run, mean and half width of the 95% t interval over seeds, and the paper's."
-    )
-    return Table("table2", caption, data, display, _notes(missing, [task], list(points)))
 
 
 # --- formatting ----------------------------------------------------------------------------------
@@ -339,7 +302,7 @@ def compute(runs: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table
         f"Compute of the {len(runs)} recorded runs: {hours:.1f} core-hours in all, one thread a "
         f"run, evaluations included ({processors})."
     )
-    return Table("compute", caption, data, display, _notes(missing, None, None))
+    return Table("compute", caption, data, display, missing_notes(missing, None, None))
 
 
 def describe_missing(missing: pd.DataFrame) -> str:
@@ -351,9 +314,10 @@ def describe_missing(missing: pd.DataFrame) -> str:
     )
 
 
-def _notes(
+def missing_notes(
     missing: pd.DataFrame | None, tasks: Sequence[str] | None, variants: Sequence[str] | None
 ) -> tuple[str, ...]:
+    """What a table says of the runs that it lacks, out of `statistics.missing_runs`."""
     if missing is None:
         return ()
     if tasks is not None:
@@ -383,25 +347,19 @@ def _task_order(tasks: pd.Series) -> pd.Series:
     return tasks.map(lambda task: order.get(task, len(order)))
 
 
-def _by_seed(scores: pd.DataFrame, task: str, variant: str, metric: str) -> pd.Series:
-    chosen = scores[
-        (scores["task"] == task) & (scores["variant"] == variant) & (scores["metric"] == metric)
-    ]
-    return chosen.set_index("seed")["value"]
-
-
 def _summary_cell(chosen: pd.DataFrame, metric: str) -> str:
     if metric not in chosen.index:
         return ABSENT if len(chosen) else MISSING
     row = chosen.loc[metric]
     if metric in PERCENT_DIGITS:
         mean, low, high = 100 * row[["mean", "low", "high"]].to_numpy(float)
-        return _plus_minus(mean, low, high, PERCENT_DIGITS[metric]) + "%"
-    cell = _plus_minus(row["mean"], row["low"], row["high"], 2)
+        return plus_minus(mean, low, high, PERCENT_DIGITS[metric]) + "%"
+    cell = plus_minus(row["mean"], row["low"], row["high"], 2)
     return f"{cell} [{row['iqm']:.2f}]" if metric == "eval_return" else cell
 
 
-def _plus_minus(mean: object, low: object, high: object, digits: int) -> str:
+def plus_minus(mean: object, low: object, high: object, digits: int) -> str:
+    """A mean and the half width of its interval as printed; nan is a missing run."""
     estimate = Estimate(float(mean), float(low), float(high), 0)  # type: ignore[arg-type]
     if np.isnan(estimate.mean):
         return MISSING
@@ -421,9 +379,10 @@ def _percent(mean: object, low: object, high: object) -> str:
     return f"{value:+.1f}% [{lower:+.1f}, {upper:+.1f}]"
 
 
-def _number(value: object, digits: int) -> str:
-    number = float(value)  # type: ignore[arg-type]
-    return MISSING if np.isnan(number) else f"{number:.{digits}f}"
+def number(value: object, digits: int) -> str:
+    """A number as printed; nan is a missing run."""
+    known = float(value)  # type: ignore[arg-type]
+    return MISSING if np.isnan(known) else f"{known:.{digits}f}"
 
 
 def _cells(display: pd.DataFrame) -> list[list[str]]:

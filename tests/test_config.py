@@ -381,6 +381,13 @@ def test_later_files_replace_whole_sections(tmp_path: Path) -> None:
     assert loaded.tasks == config.load([DEFAULT]).tasks
 
 
+def test_points_make_a_map_when_they_are_all_pairs():
+    nine = [(a, b) for a in (0.1, 0.2, 0.3) for b in (0.1, 0.2, 0.3)]
+    for points, expected in ((nine, True), (nine[:8], False), (nine[:6], False)):
+        assert config.Sensitivity("task", "SafeMR", tuple(points), (0,)).is_map is expected
+    assert config.load([DEFAULT, ROOT / "config/map.yaml"]).sensitivity.is_map
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda p: p.stem)
 def test_every_shipped_config_is_valid(path: Path) -> None:
     assert resolve(yaml.load(path.read_text(), config._StrictLoader)).runs

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from safemr import reference, statistics
+from safemr import reference, sensitivity, statistics
 from safemr.errors import UserError
 from safemr.plotting import certificate, curves, data, scenes, scores, style
 
@@ -131,6 +131,16 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
         "goal_size": np.array(0.3), "extent": np.array(2.0),
     }  # fmt: skip
     minutes = returns[["task", "variant", "step"]].assign(minutes=returns["step"] / 100)
+    weights = {
+        name: (a, b)
+        for name, a, b in (
+            ("SafeMR", 0.3, 0.1),
+            ("mine", 0.3, 0.2),
+            ("CPO", 0.4, 0.1),
+            ("absent", 0.4, 0.2),
+        )
+    }
+    learned = statistics.last_values(progress, ("sigma", "k", "n"))
     return {
         "computing time": lambda: curves.compute_curves(returns, minutes, TASKS),
         "training": lambda: curves.training_curves(returns, costs, TASKS),
@@ -140,6 +150,7 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
             returns[returns["task"] == TASKS[0]], costs[costs["task"] == TASKS[0]],
             {"SafeMR": (0.35, 0.15), "SafeMR[0.45,0.15]": (0.45, 0.15)},
         ),
+        "weights": lambda: scores.weight_map(sensitivity.weight_map(final, learned, weights).data),
         "parameters": lambda: curves.parameter_evolution(
             progress, TASKS, fixed={"FAC-phih": reference.PHI_H._asdict()}
         ),
@@ -181,6 +192,18 @@ def test_saving_twice_gives_equal_files(progress, tmp_path):
     pairs = [style.save(scores.return_against_cost(final, TASKS), tmp_path / name) for name in "ab"]
     for first, second in zip(*pairs, strict=True):
         assert first.read_bytes() == second.read_bytes()
+
+
+def test_the_weight_map_shows_every_point_where_it_belongs(progress):
+    axes = figures(progress)["weights"]().axes
+    data = sensitivity.weight_map(
+        statistics.final_scores(progress), progress.iloc[:0], {"mine": (0.3, 0.2)}
+    ).data
+    texts = {text.get_position(): text.get_text() for text in axes[0].texts}
+    assert texts[0, 1] == f"{data['return'].item():.1f}"
+    assert texts[1, 1] == "missing"
+    frames = {round(patch.get_x()): to_hex(patch.get_edgecolor()) for patch in axes[0].patches}
+    assert frames[1] == "#ffffff"  # CPO, above JointSIS
 
 
 def test_a_task_without_records_says_so(progress):

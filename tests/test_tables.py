@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from safemr import claims, reference, statistics, tables
+from safemr import claims, reference, sensitivity, statistics, tables
 from safemr.evidence import Evidence
 
 TASK, OTHER = "Pillars-0.15-Goal", "Hazards-0.15-Push"
@@ -141,7 +141,8 @@ def test_no_run_at_all_still_makes_every_table(scores):
         tables.table_one(nothing, missing=missing),
         tables.full_results(nothing, missing=missing),
         tables.push_split(nothing, missing=missing),
-        tables.table_two(nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
+        sensitivity.table_two(nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
+        sensitivity.weight_map(nothing, nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
     ):
         assert "Runs missing" in table.markdown()
 
@@ -152,11 +153,32 @@ def test_table_two_stands_beside_the_papers_parameters():
          for seed in (0, 1) for name, value in (("sigma", 0.2), ("k", 0.9), ("n", 2.0))],
         columns=["task", "variant", "seed", "metric", "value"],
     )  # fmt: skip
-    table = tables.table_two(final, {"SafeMR": (0.35, 0.15)})
+    table = sensitivity.table_two(final, {"SafeMR": (0.35, 0.15)})
     rows = {row[1]: row[2:] for row in cells(table)[2:]}
     assert rows["mean"] == ["0.205", "0.905", "2.005"]
     assert rows["paper"] == ["0.201", "0.835", "2.084"]
     assert rows["1"][0] == "0.210"
+
+
+def test_weight_map_measures_each_point_against_the_method_without_weights(scores):
+    learned = pd.DataFrame(
+        [(TASK, "SafeMR", seed, name, value)
+         for seed in (0, 1, 2) for name, value in (("sigma", 0.2), ("k", 0.9), ("n", 2.0))],
+        columns=["task", "variant", "seed", "metric", "value"],
+    )  # fmt: skip
+    table = sensitivity.weight_map(
+        scores, learned, {"SafeMR": (0.35, 0.15), "absent": (0.35, 0.05)}
+    )
+    absent, found = cells(table)[2:]
+    gap = statistics.difference_interval(
+        np.array(RETURNS[TASK, "SafeMR"]), np.array(RETURNS[TASK, "JointSIS"])
+    )
+    assert absent[:5] == ["[0.35, 0.05]", "0", "missing", "missing", "missing"]
+    assert found[:2] == ["[0.35, 0.15]", "3"]
+    assert found[3] == f"{gap.mean:.2f} ± {gap.half_width:.2f}"
+    assert found[4:] == ["0.00", "100.0%", "0.200", "0.900", "2.000"]
+    row = table.data.set_index("variant").loc["SafeMR"]
+    assert (row["gain_low"], row["gain_high"]) == (gap.low, gap.high)
 
 
 def test_push_returns_are_split_into_their_parts():

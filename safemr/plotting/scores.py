@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 
 from safemr.plotting import style
 from safemr.statistics import Aggregates, Estimate
@@ -126,6 +128,62 @@ def aggregate_scores(
     ]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=8)
+    return figure
+
+
+_MAPPED = {
+    "return": ("final return", "{:.1f}"),
+    "half_width": ("half width of its 95% interval", "{:.1f}"),
+    "violating_steps": ("violating steps an episode", "{:.2f}"),
+    "sigma": (r"learned $\sigma$", "{:.3f}"),
+    "k": ("learned $k$", "{:.3f}"),
+    "n": ("learned $n$", "{:.3f}"),
+}
+
+
+def draw_grid(data: pd.DataFrame, column: str, ax: Axes, *, number: str = "{:.2f}") -> Axes:
+    """One value a point [a, b] as shade and number; data: `sensitivity.weight_map`'s."""
+    table = data.pivot(index="b", columns="a", values=column)
+    values = table.to_numpy(float)
+    known = values[np.isfinite(values)]
+    low, high = (known.min(), known.max()) if len(known) else (0.0, 1.0)
+    if high - low < 1e-9:  # one shade, not noise
+        low, high = low - 1.0, high + 1.0
+    ax.imshow(values, origin="lower", cmap="viridis", vmin=low, vmax=high, aspect="auto")
+    for (row, place), value in np.ndenumerate(values):
+        text = number.format(value) if np.isfinite(value) else "missing"
+        dark = not np.isfinite(value) or value > low + 0.6 * (high - low)
+        ax.text(place, row, text, ha="center", va="center", fontsize="small",
+                color="k" if dark else "w")  # fmt: skip
+    ax.set_xticks(range(len(table.columns)), [f"{a:g}" for a in table.columns])
+    ax.set_yticks(range(len(table.index)), [f"{b:g}" for b in table.index])
+    ax.grid(False)
+    ax.tick_params(length=0)
+    return ax
+
+
+@style.styled
+def weight_map(data: pd.DataFrame) -> Figure:
+    """Final performance and learned zeta over the weights [a, b]; data: `sensitivity.weight_map`'s.
+
+    A frame marks the points whose return is told apart from the baseline's: white where it is
+    higher, black where it is lower.
+    """
+    figure = style.new_figure(style.TEXT_WIDTH, 4.2)
+    axes = figure.subplots(2, 3, sharex=True, sharey=True)
+    for ax, (column, (title, number)) in zip(axes.flat, _MAPPED.items(), strict=True):
+        draw_grid(data, column, ax, number=number)
+        ax.set_title(title)
+    rank = {name: {v: i for i, v in enumerate(sorted(set(data[name])))} for name in "ab"}
+    for _, row in data.iterrows():
+        side = "w" if row["gain_low"] > 0 else "k" if row["gain_high"] < 0 else None
+        if side:
+            corner = (rank["a"][row["a"]] - 0.46, rank["b"][row["b"]] - 0.46)
+            axes[0, 0].add_patch(Rectangle(corner, 0.92, 0.92, fill=False, ec=side, lw=1.2))
+    for ax in axes[-1]:
+        ax.set_xlabel(r"$a$, weight of $(\sigma+d_{\min})^n$")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("$b$, weight of $k$")
     return figure
 
 

@@ -1,26 +1,47 @@
 # The points [a, b] of the regularizer. They are variants of the one training rule.
+LEARNED_AT_POINTS = dict(
+    task=CONFIG.sensitivity and CONFIG.sensitivity.task,
+    expected=expected(PLAN.sensitivity),
+    points={label: list(point) for label, point in PLAN.points.items()},
+)
+
+
 rule sensitivity:
     input:
         progress=rules.aggregate.output.progress,
         runs=rules.aggregate.output.runs,
     output:
-        pdf=f"{FIGURES}/sensitivity.pdf",
-        png=report(
-            f"{FIGURES}/sensitivity.png",
-            caption="../report/sensitivity.rst",
-            category="Figures",
-        ),
+        **figure_outputs("sensitivity"),
         table=expand(f"{RESULTS}/tables/table2.{{end}}", end=["csv", "md", "tex"]),
     log:
         f"{LOGS}/sensitivity.log",
     threads: 1
     params:
-        task=CONFIG.sensitivity and CONFIG.sensitivity.task,
-        expected=expected(PLAN.sensitivity),
-        points={label: list(point) for label, point in PLAN.points.items()},
+        **LEARNED_AT_POINTS,
     script:
         "../scripts/sensitivity.py"
 
 
+# The same question for a whole grid of points, which curves could not show.
+rule weight_map:
+    input:
+        progress=rules.aggregate.output.progress,
+        scores=rules.aggregate.output.scores,
+        runs=rules.aggregate.output.runs,
+    output:
+        **figure_outputs("weight_map"),
+        table=expand(f"{RESULTS}/tables/weight_map.{{end}}", end=["csv", "md", "tex"]),
+    log:
+        f"{LOGS}/weight_map.log",
+    threads: 1
+    params:
+        **LEARNED_AT_POINTS,
+        tolerance=CONFIG.cost_tolerance,
+        clean_share=CONFIG.zero_violation_share,
+    script:
+        "../scripts/weight_map.py"
+
+
 if CONFIG.sensitivity:
-    TARGETS += rules.sensitivity.output
+    shown = rules.weight_map if CONFIG.sensitivity.is_map else rules.sensitivity
+    TARGETS += shown.output

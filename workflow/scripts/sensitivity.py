@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import statistics, tables
+from safemr import sensitivity, statistics
 from safemr.plotting import curves, style
 
 params = snakemake.params
@@ -15,9 +15,9 @@ returns, costs = (
     statistics.learning_curves(chosen, metric) for metric in ("eval_return", "eval_cost")
 )
 figure = curves.sensitivity(returns, costs, points)
-style.save(figure, Path(snakemake.output.pdf).with_suffix(""))
+style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))
 learned = statistics.last_values(chosen, ("sigma", "k", "n"))
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 missing = statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs))
-table = tables.table_two(learned, points, missing=missing, task=params.task)
+table = sensitivity.table_two(learned, points, missing=missing, task=params.task)
 table.write(Path(snakemake.output.table[0]).parent)

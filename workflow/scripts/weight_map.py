@@ -1,0 +1,24 @@
+"""Final performance and learned parameters over a grid of weights [a, b]."""
+
+from pathlib import Path
+
+import pandas as pd
+
+from safemr import sensitivity, statistics, tables
+from safemr.plotting import scores as drawings
+from safemr.plotting import style
+
+params = snakemake.params
+points = {variant: (a, b) for variant, (a, b) in params.points.items()}
+learned = statistics.last_values(pd.read_csv(snakemake.input.progress), ("sigma", "k", "n"))
+expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
+table = sensitivity.weight_map(
+    pd.read_csv(snakemake.input.scores),
+    learned,
+    points,
+    missing=statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs)),
+    rule=tables.SafetyRule(params.tolerance, params.clean_share),
+    task=params.task,
+)
+table.write(Path(snakemake.output.table[0]).parent)
+style.save(drawings.weight_map(table.data), Path(snakemake.output.pdf[0]).with_suffix(""))
