@@ -2,9 +2,9 @@
 
 A rule turns the evidence into a `Finding`: our number with its 95% interval, a verdict, and the
 reason. docs/claims.md states the rules in words. Common to all: a verdict needs every run of the
-grid that it speaks about, else it is "inconclusive: runs missing: ..."; an interval that contains
-the threshold is inconclusive; and five seeds support 95% intervals, not corrections for the number
-of claims.
+grid that it speaks about, else it is "inconclusive: runs missing: ..." (a claim about all tasks can
+be refuted before by one of them); an interval that contains the threshold is inconclusive; and few
+seeds support 95% intervals, not corrections for the number of claims.
 """
 
 from __future__ import annotations
@@ -25,13 +25,16 @@ from safemr.evidence import (
     at_most,
     by_interval,
     describe,
+    on_every_task,
     overall,
     smooth_curves,
+    surely_below,
     unavailable,
 )
 from safemr.statistics import Estimate
 from safemr.tables import Table, best_safe_baseline
 
+COLUMNS = ["estimate", "low", "high", "count"]
 COVERS = 0.01  # a certificate covers the true unsafe set if it misses at most this share of it
 GROWTH = 2.0  # "bounded": the last quarter at most this many times the largest before
 
@@ -52,19 +55,21 @@ class Claim:
 
 def smaller_than_joint_sis(evidence: Evidence) -> Finding:
     """Volume of JointSIS's unsafe set minus SafeMR's, in units of the true one: Welch, above 0."""
-    volumes = [evidence.measured(variant, "volume_ratio") for variant in ("JointSIS", "SafeMR")]
-    absent = [v for v, x in zip(("JointSIS", "SafeMR"), volumes, strict=True) if not len(x)]
+    names = ("JointSIS", reference.METHOD)
+    absent = evidence.missing_flights(names)
     if absent:
-        return unavailable(f"aircraft measurements of {' and '.join(absent)}")
+        return unavailable(absent)
+    volumes = [evidence.measured(variant, "volume_ratio") for variant in names]
     gap = statistics.difference_interval(volumes[0], volumes[1])
     return by_interval(gap, 0.0, "JointSIS - SafeMR")
 
 
 def covers_true_set(evidence: Evidence) -> Finding:
     """Missed share of SafeMR: confirmed if its interval is at or below 1%, refuted if above."""
-    missed = evidence.measured("SafeMR", "missed_share")
-    if not len(missed):
-        return unavailable("aircraft measurements of SafeMR")
+    absent = evidence.missing_flights([reference.METHOD])
+    if absent:
+        return unavailable(absent)
+    missed = evidence.measured(reference.METHOD, "missed_share")
     return at_most(statistics.mean_interval(missed), COVERS, "missed share")
 
 
@@ -94,10 +99,11 @@ def highest_safe_return(task: str, evidence: Evidence) -> Finding:
     ours = evidence.of(task, reference.METHOD, "eval_return")
     if not evidence.rule.is_safe(evidence.scores, task, reference.METHOD):
         cost = statistics.mean_interval(evidence.of(task, reference.METHOD, evidence.rule.cost))
-        return Finding(cost, "refuted", f"SafeMR is not safe: {describe(cost)} violating steps")
+        return Finding(NOTHING, "refuted", f"SafeMR is not safe: {describe(cost)} violating steps")
     best, returns = best_safe_baseline(evidence.scores, task, evidence.rule, baselines)
     if not best:
-        return Finding(statistics.mean_interval(ours), "confirmed", "no baseline is safe")
+        own = describe(statistics.mean_interval(ours))
+        return Finding(NOTHING, "confirmed", f"no baseline is safe; SafeMR returns {own}")
     gap = statistics.difference_interval(ours, returns)
     return by_interval(gap, 0.0, f"SafeMR - {best}")
 
@@ -119,14 +125,14 @@ def zero_violations(evidence: Evidence) -> Finding:
             return Finding(estimate, "refuted", shown)
         return Finding(estimate, "inconclusive", f"{shown}: near one, not one")
 
-    return _on_every_task(evidence, [reference.METHOD], judge)
+    return on_every_task(evidence, [reference.METHOD], judge)
 
 
 def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
     """The algorithm is unsafe on every task, beyond doubt of its interval.
 
     Confirmed on a task if the interval of its violating steps lies above the tolerance or that of
-    its clean share below the rule's; refuted if it is safe by the rule; else open.
+    its clean share below the rule's (`surely_below`); refuted if it is safe by the rule; else open.
     """
     rule = evidence.rule
 
@@ -136,11 +142,13 @@ def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
         shown = f"{describe(cost)} violating steps, clean share {describe(clean)}"
         if rule.is_safe(evidence.scores, task, variant):
             return Finding(cost, "refuted", f"{shown}: safe")
-        if cost.low > rule.tolerance or clean.high < rule.clean_share:
-            return Finding(cost, "confirmed", shown)
+        if cost.low > rule.tolerance:
+            return Finding(cost, "confirmed", f"{shown}: the steps decide")
+        if surely_below(clean, rule.clean_share):
+            return Finding(cost, "confirmed", f"{shown}: the share decides")
         return Finding(cost, "inconclusive", f"{shown}: unsafe on average only")
 
-    return _on_every_task(evidence, [variant], judge)
+    return on_every_task(evidence, [variant], judge)
 
 
 def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding:
@@ -156,12 +164,13 @@ def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding
             if somewhere:
                 return None
             cost = statistics.mean_interval(evidence.of(task, variant, evidence.rule.cost))
-            return Finding(cost, "refuted", f"{variant} is not safe: {describe(cost)} steps")
+            reason = f"{variant} is not safe: {describe(cost)} violating steps"
+            return Finding(NOTHING, "refuted", reason)
         returns = [evidence.of(task, name, "eval_return") for name in names]
         gap = statistics.difference_interval(returns[0], returns[1])
         return by_interval(gap, 0.0, f"SafeMR - {variant}")
 
-    return _on_every_task(evidence, names, judge, otherwise=f"{variant} is safe on no task")
+    return on_every_task(evidence, names, judge, otherwise=f"{variant} is safe on no task")
 
 
 # --- the points [a, b] ---------------------------------------------------------------------------
@@ -212,8 +221,10 @@ def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
 
     Feasible means that the safe action set is nonempty at every state, so one replayable state
     without a safe action refutes it; a search that finds none leaves it unrefuted, and then the
-    analytic condition with the aligned brake must hold too. The estimate is the largest infeasible
-    share; it has no sampling interval, the states are a fixed low-discrepancy set.
+    analytic condition with the aligned brake must hold too. The estimate is the least constraint
+    value g that the best action reaches at the worst state found: positive means that no action
+    satisfies the constraint. It has no sampling interval, the states are a fixed low-discrepancy
+    set, refined around the worst. Of each learned variant the first recorded seed is certified.
     """
     rows = evidence.certificates
     if rows is not None:
@@ -222,7 +233,7 @@ def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
         return unavailable(f"certify results of {prefix} ...")
     worst = rows.sort_values("worst_margin").iloc[-1]
     share = float(rows["infeasible_share"].max())
-    estimate = Estimate(share, np.nan, np.nan, len(rows))
+    estimate = Estimate(float(worst["worst_margin"]), np.nan, np.nan, len(rows))
     aligned = rows[["margin_inside_aligned", "margin_outside_aligned"]].to_numpy()
     drag = rows[["margin_inside_drag", "margin_outside_drag"]].to_numpy()
     shown = (
@@ -231,8 +242,11 @@ def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
         f"{(drag >= 0).all(1).sum()} with drag only"
     )
     if worst["worst_margin"] >= 0:
-        found = f"{shown}; {worst['certificate']} has a state whose best margin is "
-        return Finding(estimate, "refuted", f"{found}{worst['worst_margin']:+.4f}")
+        found = (
+            f"{worst['certificate']} has a state, not necessarily one that is ever reached, where "
+        )
+        found += f"every action leaves g above 0, at best {worst['worst_margin']:+.4f}"
+        return Finding(estimate, "refuted", f"{found}; {shown}")
     verdict: Verdict = "confirmed" if (aligned >= 0).all() else "inconclusive"
     return Finding(estimate, verdict, f"{shown}; no infeasible state found")
 
@@ -242,49 +256,56 @@ def certificate_settles_last(evidence: Evidence) -> Finding:
 
     A curve has settled where it stays within a tenth of its range of its final value, after a
     trailing average over a tenth of its points. One number a SafeMR run: the last of sigma, k, n
-    minus the last of the other two. Interval above 0.
+    minus the last of the other two. Interval above 0 on every task.
     """
     late = ("sigma", "k", "n")
-    runs = smooth_curves(
-        evidence.progress, evidence.tasks, (*late, "train_return", "multiplier_mean")
-    )
-    if not runs:
-        return unavailable("SafeMR on any task")
-    lags = []
-    for curves in runs:
-        settled = {
-            metric: statistics.settling_share(steps, values)
-            for metric, (steps, values) in curves.items()
-        }
-        others = [settled[metric] for metric in settled if metric not in late]
-        own = [settled[metric] for metric in late if metric in settled]
-        if own and others:
-            lags.append(max(own) - max(others))
-    return by_interval(statistics.mean_interval(np.array(lags)), 0.0, "settling lag")
+    metrics = (*late, "train_return", "multiplier_mean")
+
+    def judge(task: str) -> Finding:
+        lags = []
+        for curves in smooth_curves(evidence.progress, task, metrics):
+            settled = {
+                metric: statistics.settling_share(steps, values)
+                for metric, (steps, values) in curves.items()
+            }
+            others = [settled[metric] for metric in settled if metric not in late]
+            own = [settled[metric] for metric in late if metric in settled]
+            if own and others:
+                lags.append(max(own) - max(others))
+        if not lags:
+            return unavailable(f"curves of SafeMR on {task}")
+        return by_interval(statistics.mean_interval(np.array(lags)), 0.0, "settling lag")
+
+    return on_every_task(evidence, [reference.METHOD], judge)
 
 
 def losses_bounded(evidence: Evidence) -> Finding:
     """Largest |value| in the last quarter over that in the rest, every loss and gradient norm.
 
-    One number a SafeMR run, its worst metric. Confirmed if the interval ends at or below 2;
-    refuted if it begins above, or if any value is not finite.
+    One number a SafeMR run, its worst metric, after the same trailing average. Confirmed if the
+    interval ends at or below 2 on every task; refuted if it begins above, or if any value is not
+    finite. A run that diverged leaves no record and counts as missing.
     """
     names = evidence.progress.loc[evidence.progress["variant"] == reference.METHOD, "metric"]
     metrics = [m for m in names.unique() if m.endswith(("_loss", "_grad_norm"))]
-    runs = smooth_curves(evidence.progress, evidence.tasks, metrics)
-    if not runs:
-        return unavailable("losses and gradient norms of SafeMR")
-    ratios = []
-    for curves in runs:
-        worst = 0.0
-        for steps, values in curves.values():
-            if not np.isfinite(values).all():
-                return Finding(NOTHING, "refuted", "a loss or gradient norm is not finite")
-            late = steps > 0.75 * steps[-1]
-            early = np.abs(values[~late]).max(initial=0.0)
-            worst = max(worst, float(np.abs(values[late]).max() / max(early, 1e-12)))
-        ratios.append(worst)
-    return at_most(statistics.mean_interval(np.array(ratios)), GROWTH, "growth")
+
+    def judge(task: str) -> Finding:
+        runs = smooth_curves(evidence.progress, task, metrics)
+        if not runs:
+            return unavailable(f"losses and gradient norms of SafeMR on {task}")
+        ratios = []
+        for curves in runs:
+            worst = 0.0
+            for steps, values in curves.values():
+                if not np.isfinite(values).all():
+                    return Finding(NOTHING, "refuted", "a loss or gradient norm is not finite")
+                late = steps > 0.75 * steps[-1]
+                early = np.abs(values[~late]).max(initial=0.0)
+                worst = max(worst, float(np.abs(values[late]).max() / max(early, 1e-12)))
+            ratios.append(worst)
+        return at_most(statistics.mean_interval(np.array(ratios)), GROWTH, "growth")
+
+    return on_every_task(evidence, [reference.METHOD], judge)
 
 
 # --- the list ------------------------------------------------------------------------------------
@@ -356,22 +377,23 @@ def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
         ),
         Claim(
             "feasibility_paper", "All three sets of learned parameters are feasible (the paper's)",
-            "largest share of searched states without a safe action", "certificates",
+            "least g of the best action at the worst state found", "certificates",
             partial(parameters_feasible, "paper"),
         ),
         Claim(
             "feasibility_ours", "All learned parameters are feasible (SafeMR's, learned here)",
-            "largest share of searched states without a safe action", "certificates",
+            "least g of the best action at the worst state found", "certificates",
             partial(parameters_feasible, reference.METHOD),
         ),
         Claim(
             "slowest_certificate", "The energy function converges the most slowly",
-            "share of training by which zeta settles later than return and multiplier",
+            "share of training by which zeta settles later, the task that decides",
             "parameters", certificate_settles_last,
         ),
         Claim(
             "bounded", "Loss and gradient norm do not increase too much and cause no divergence",
-            "largest value in the last quarter over the largest before", "parameters",
+            "largest value in the last quarter over the largest before, the task that decides",
+            "parameters",
             losses_bounded,
         ),
     ]  # fmt: skip
@@ -394,8 +416,8 @@ def claims_table(evidence: Evidence) -> Table:
             "paper's statement": data["statement"],
             "our measure": data["measure"],
             "ours [95% interval]": [
-                describe(Estimate(mean, low, high, 0))
-                for mean, low, high in data[["estimate", "low", "high"]].to_numpy(float)
+                describe(Estimate(mean, low, high, int(count)))
+                for mean, low, high, count in data[COLUMNS].to_numpy(float)
             ],
             "verdict": data["verdict"],
             "why": data["reason"],
@@ -404,28 +426,10 @@ def claims_table(evidence: Evidence) -> Table:
     )  # fmt: skip
     caption = (
         "Claims of the paper and what these runs say of them, by rules fixed before the reported "
-        f"seeds were run (docs/claims.md). {str(evidence.rule).capitalize()}."
+        "seeds were run and made stricter since (docs/claims.md). "
+        f"{str(evidence.rule).capitalize()}."
     )
     return Table("claims", caption, data, display)
-
-
-def _on_every_task(
-    evidence: Evidence,
-    variants: Sequence[str],
-    judge: Callable[[str], Finding | None],
-    otherwise: str = "",
-) -> Finding:
-    """`overall` of the tasks; one on which runs of these variants are missing is open.
-
-    So what has been run cannot confirm what the paper says of every task, but can refute it. A task
-    that ``judge`` leaves out (None) has no part; ``otherwise`` refutes where all are left out.
-    """
-    absent = {task: evidence.missing([(task, v) for v in variants]) for task in evidence.tasks}
-    if all(absent.values()):
-        return unavailable("; ".join(absent.values()))
-    found = {task: unavailable(what) if what else judge(task) for task, what in absent.items()}
-    parts = {task: finding for task, finding in found.items() if finding is not None}
-    return overall(parts) if parts else Finding(NOTHING, "refuted", otherwise)
 
 
 def _missing_points(evidence: Evidence, variants: Sequence[str]) -> str:

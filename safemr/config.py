@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from safemr.errors import UserError
+from safemr.strict_yaml import read_yaml, show, typed
 
 FAMILIES = ("off_policy", "on_policy")
 WANDB_MODES = ("disabled", "offline", "online")
@@ -90,6 +89,14 @@ class Evaluation:
 
 
 @dataclass(frozen=True)
+class UnseenLayouts:
+    """Final policies on layouts that no run was evaluated on: how many, and the first seed."""
+
+    episodes: int
+    seed: int
+
+
+@dataclass(frozen=True)
 class Config:
     """A validated configuration; see config/config.yaml for the meaning of each key."""
 
@@ -99,6 +106,7 @@ class Config:
     budget: Mapping[str, int]
     log_points: int
     evaluation: Evaluation
+    unseen_layouts: UnseenLayouts | None
     task_overrides: Mapping[str, TaskOverrides]
     sensitivity: Sensitivity | None
     aircraft: Aircraft | None
@@ -127,36 +135,6 @@ def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None
     return parse(merged | {key: typed(value) for key, value in (overrides or {}).items()})
 
 
-def typed(value: Any) -> Any:
-    """A value of a command line: inside lists and mappings Snakemake leaves scalars as text."""
-    if isinstance(value, str):
-        try:
-            return yaml.load(value, _StrictLoader)
-        except (yaml.YAMLError, ValueError, RecursionError):
-            return value
-    if isinstance(value, Mapping):
-        return {key: typed(item) for key, item in value.items()}
-    return [typed(item) for item in value] if isinstance(value, (list, tuple)) else value
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The top-level mapping of a YAML file; duplicate keys are errors, 1e-3 is a number."""
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), _StrictLoader)
-    except OSError as error:
-        raise UserError(f"cannot read the config file {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
-        where = f"{path}, line {mark.line + 1}" if mark else f"{path}"
-        raise UserError(f"{where}: {problem}") from error
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise UserError(f"{path} must hold a mapping, not {show(content)}")
-    return content
-
-
 def parse(raw: Any) -> Config:
     """Check structure, types and ranges of a configuration and return it."""
     top = _Section(raw, "the config", _TOP_LEVEL)
@@ -177,6 +155,7 @@ def parse(raw: Any) -> Config:
             _integer(evaluation.required("episodes"), "evaluation.episodes", 1),
             _integer(evaluation.get("seed", 10_000), "evaluation.seed", 0, LARGEST_SEED),
         ),
+        unseen_layouts=_unseen(top.get("unseen_layouts")),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
             for name, value in _labelled(top.get("task_overrides", {}), "task_overrides")
@@ -219,36 +198,17 @@ def unknown(kind: str, name: Any, known: Iterable[str], where: str = "") -> User
     return UserError(f"unknown {kind} {show(name)}{' in ' + where if where else ''}; {remedy}")
 
 
-def show(value: Any) -> str:
-    """A short one-line picture of any value for an error message."""
-    text = ascii(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """YAML without duplicate keys, and with 1e-3 as a number (YAML 1.1 reads it as text)."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if key.tag != "tag:yaml.org,2002:merge" and key.value.__hash__ and key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {show(key.value)} stands twice", key.start_mark
-                )
-            if isinstance(key.value, str):
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-_StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
-    list("-+.0123456789"),
-)
-
 _TOP_LEVEL = (
     *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
-    *("sensitivity", "aircraft", "outside", "results_root", "figures_root", "allow_missing"),
+    *(
+        "unseen_layouts",
+        "sensitivity",
+        "aircraft",
+        "outside",
+        "results_root",
+        "figures_root",
+        "allow_missing",
+    ),
     *("wandb", "safe"),
 )
 
@@ -378,6 +338,16 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
             family: _mapping(values, f"{where}.hyperparameters.{family}")
             for family, values in families.value.items()
         },
+    )
+
+
+def _unseen(value: Any) -> UnseenLayouts | None:
+    if not value and (value is None or isinstance(value, Mapping)):
+        return None
+    section = _Section(value, "unseen_layouts", ("episodes", "seed"))
+    return UnseenLayouts(
+        _integer(section.required("episodes"), "unseen_layouts.episodes", 1),
+        _integer(section.get("seed", 20_000), "unseen_layouts.seed", 0, LARGEST_SEED),
     )
 
 

@@ -1,13 +1,27 @@
-"""Evaluation of a policy on fixed seeds, the same for every algorithm."""
+"""Evaluation of a policy on fixed seeds, the same for every algorithm.
+
+safemr evaluate results/runs/Pillars-0.15-Goal/SafeMR/seed0-* --episodes 100 --seed 20000
+"""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from safemr.episodes import EpisodeStatistics
+from safemr.errors import UserError
+
+if TYPE_CHECKING:
+    from safemr.measurements import Measurements
+
+SEED = 20_000  # apart from the layouts of the runs' own evaluations
+EPISODES = 100
 
 
 class Acts(Protocol):
@@ -16,11 +30,10 @@ class Acts(Protocol):
     def act(self, observations: NDArray[Any], deterministic: bool = True) -> NDArray[Any]: ...
 
 
-def evaluate(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> dict[str, float]:
+def play(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> EpisodeStatistics:
     """One episode in every sub-environment of ``envs``, which are reset with seed, seed + 1, ...
 
-    Returns the averages of `EpisodeStatistics` over these episodes. Reusing ``envs`` from one
-    evaluation to the next gives the same layouts each time.
+    Reusing ``envs`` from one call to the next gives the same layouts each time.
     """
     statistics = EpisodeStatistics(envs.num_envs)
     running = np.ones(envs.num_envs, bool)
@@ -30,4 +43,88 @@ def evaluate(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> 
         observations, rewards, terminated, truncated, infos = envs.step(actions)
         statistics.update(rewards, terminated, truncated, infos, counted=running)
         running &= ~(terminated | truncated)
-    return statistics.pop()
+    return statistics
+
+
+def evaluate(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> dict[str, float]:
+    """The averages of `EpisodeStatistics` over the episodes of `play`."""
+    return play(policy, envs, seed, deterministic).pop()
+
+
+def evaluate_record(
+    folder: Path, *, episodes: int = EPISODES, seed: int = SEED, deterministic: bool = True
+) -> dict[str, float]:
+    """A record's final policy on ``episodes`` layouts of its task: `evaluate`, and ``return_sd``.
+
+    ``return_sd`` is the standard deviation of the return over the layouts (nan for one).
+
+    Raises:
+        UserError: the record is damaged or has no policy.
+    """
+    from safemr.policies import load_policy
+    from safemr.records import CONFIG, verify_record
+    from safemr.train import make_envs
+
+    verify_record(folder)
+    policy = load_policy(folder)
+    task = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["task"]
+    envs = make_envs(task, episodes)
+    try:
+        played = play(policy, envs, seed, deterministic)
+    finally:
+        envs.close()
+    returns = played.finished[:, played.names.index("return")]
+    return {
+        **played.pop(),
+        "return_sd": float(returns.std(ddof=1)) if episodes > 1 else float("nan"),
+    }
+
+
+def measured(
+    measurements: Measurements, folder: Path, *, episodes: int, seed: int
+) -> Mapping[str, float]:
+    """`evaluate_record`, kept among ``measurements``."""
+    from safemr.measurements import record_inputs, record_label
+
+    inputs = {**record_inputs(folder), "episodes": episodes, "seed": seed}
+    return measurements.rows(
+        "unseen_layouts",
+        record_label(folder),
+        inputs,
+        lambda: evaluate_record(folder, episodes=episodes, seed=seed),
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """``safemr evaluate RECORD ...``: one line a record."""
+    parser = argparse.ArgumentParser(
+        prog="safemr evaluate", description="Fly the final policies of run records."
+    )
+    parser.add_argument("records", type=Path, nargs="+", metavar="RECORD", help="its folder")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="one layout each")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the first layout")
+    parser.add_argument("--exploring", action="store_true", help="sample the actions")
+    options = parser.parse_args(arguments)
+    if options.episodes < 1 or options.seed < 0:
+        raise UserError("--episodes must be 1 or more, and --seed 0 or more")
+    for folder in options.records:
+        found = evaluate_record(
+            folder,
+            episodes=options.episodes,
+            seed=options.seed,
+            deterministic=not options.exploring,
+        )
+        print(
+            f"{folder}: return {found['return']:.2f} (sd {found['return_sd']:.2f} over "
+            f"{options.episodes} layouts), cost {found['cost']:.3f}, violating steps "
+            f"{found['cost_indicator']:.3f}, clean episodes {found['zero_violation_share']:.1%}",
+            flush=True,
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    from safemr.cli import reported_errors
+
+    with reported_errors():
+        raise SystemExit(main())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -54,6 +54,26 @@ class Evidence:
                     continue
             if (task, variant) not in present:
                 texts.append(f"{variant} on {task} (all)")
+        return "; ".join(texts)
+
+    def missing_flights(self, variants: Iterable[str]) -> str:
+        """What the aircraft comparison lacks of these learners, in words; "" if nothing."""
+        texts = []
+        for variant in variants:
+            found = set() if self.aircraft is None else set(
+                self.aircraft.loc[self.aircraft["variant"] == variant, "seed"].dropna().astype(int)
+            )  # fmt: skip
+            wanted = pd.DataFrame(columns=["task", "variant", "seed"])
+            if self.expected is not None:
+                wanted = self.expected[
+                    (self.expected["variant"] == variant)
+                    & (self.expected["task"] == reference.AIRCRAFT_TASK)
+                ]
+            absent = wanted[~wanted["seed"].isin(found)]
+            if not found:
+                texts.append(f"{variant} on {reference.AIRCRAFT_TASK} (all)")
+            elif len(absent):
+                texts.append(describe_missing(absent))
         return "; ".join(texts)
 
     def of(self, task: str, variant: str, metric: str) -> np.ndarray:
@@ -112,22 +132,49 @@ def at_most(estimate: Estimate, bound: float, what: str) -> Finding:
     return Finding(estimate, "inconclusive", f"{shown}: the interval contains {bound:g}")
 
 
+def surely_below(estimate: Estimate, bound: float) -> bool:
+    """Whether the interval ends below the bound; seeds that are all equal are no interval.
+
+    Shares of a few episodes are coarse, so that equal values in every seed say little, but for 0.
+    """
+    return bool(estimate.high < bound and (estimate.low < estimate.high or estimate.mean == 0))
+
+
 def unavailable(what: str) -> Finding:
     """The finding of a claim whose runs are missing."""
     return Finding(NOTHING, "inconclusive", f"runs missing: {what}")
 
 
+def on_every_task(
+    evidence: Evidence,
+    variants: Sequence[str],
+    judge: Callable[[str], Finding | None],
+    otherwise: str = "",
+) -> Finding:
+    """`overall` of the tasks; one on which runs of these variants are missing is open.
+
+    So what has been run cannot confirm what the paper says of every task, but can refute it. A task
+    that ``judge`` leaves out (None) has no part; ``otherwise`` refutes where all are left out.
+    """
+    absent = {task: evidence.missing([(task, v) for v in variants]) for task in evidence.tasks}
+    if all(absent.values()):
+        return unavailable("; ".join(absent.values()))
+    found = {task: unavailable(what) if what else judge(task) for task, what in absent.items()}
+    parts = {task: finding for task, finding in found.items() if finding is not None}
+    return overall(parts) if parts else Finding(NOTHING, "refuted", otherwise)
+
+
 def smooth_curves(
-    progress: pd.DataFrame, tasks: Sequence[str], metrics: Sequence[str]
+    progress: pd.DataFrame, task: str, metrics: Sequence[str]
 ) -> list[dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Of each SafeMR run: metric -> steps and values, averaged over a trailing tenth of the log."""
+    """Of each SafeMR run on a task: metric -> steps, values averaged over a tenth of the log."""
     chosen = progress[
         (progress["variant"] == reference.METHOD)
         & progress["metric"].isin(list(metrics))
-        & progress["task"].isin(list(tasks))
+        & (progress["task"] == task)
     ].dropna(subset=["value"])
     runs = []
-    for _, run in chosen.groupby(["task", "seed"]):
+    for _, run in chosen.groupby("seed"):
         curves = {}
         for metric, curve in run.sort_values("step").groupby("metric"):
             window = max(1, len(curve) // 10)
@@ -142,5 +189,6 @@ def describe(estimate: Estimate) -> str:
     if np.isnan(estimate.mean):
         return "–"
     if np.isnan(estimate.low) or estimate.low == estimate.high:
-        return f"{estimate.mean:.3g}"
+        equal = estimate.low == estimate.high and estimate.size > 1
+        return f"{estimate.mean:.3g}" + " in every seed" * equal
     return f"{estimate.mean:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]"

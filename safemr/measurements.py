@@ -34,6 +34,7 @@ VERSIONS = {
     "certificates": 1,
     "margins": 1,
     "rollouts": 1,
+    "unseen_layouts": 1,
     "aircraft_frontier": 1,
     "aircraft_slices": 1,
     "aircraft_learners": 1,

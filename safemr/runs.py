@@ -22,8 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from safemr import records
-from safemr.config import FAMILIES, Config, Variant, show, unknown
+from safemr.config import FAMILIES, Config, Variant, unknown
 from safemr.errors import UserError
+from safemr.strict_yaml import show
 
 _ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
 

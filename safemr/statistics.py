@@ -221,6 +221,19 @@ def last_values(progress: pd.DataFrame, metrics: Sequence[str]) -> pd.DataFrame:
     return rows.sort_values("step").groupby(keys, sort=False)["value"].last().reset_index()
 
 
+def training_violations(progress: pd.DataFrame) -> pd.DataFrame:
+    """Score table of ``train_violations``: violating steps of all episodes that training finished.
+
+    A row of the log has the mean over the episodes finished since the last; the sum is exact.
+    """
+    keys = ["task", "variant", "seed"]
+    wide = progress[progress["metric"].isin(["train_cost_indicator", "train_episodes"])]
+    wide = wide.pivot_table(index=[*keys, "step"], columns="metric", values="value")
+    wide = wide.reindex(columns=["train_cost_indicator", "train_episodes"]).dropna()
+    total = (wide["train_cost_indicator"] * wide["train_episodes"]).groupby(level=keys).sum()
+    return total.round().rename("value").reset_index().assign(metric="train_violations")
+
+
 def settling_share(steps: np.ndarray, values: np.ndarray, band: float = 0.1) -> float:
     """Share of training after which a curve stays within `band` of its range of its final value.
 
@@ -339,6 +352,7 @@ def core_minutes(progress: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 def missing_runs(expected: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Rows (task, variant, seed) of `expected` that `runs` lacks, in the order expected."""
     keys = ["task", "variant", "seed"]
+    expected = expected.drop_duplicates(keys)
     present = set(runs[keys].itertuples(index=False, name=None))
     absent = [row not in present for row in expected[keys].itertuples(index=False, name=None)]
     return expected.loc[absent, keys].reset_index(drop=True)

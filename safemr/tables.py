@@ -26,13 +26,16 @@ RESULT_METRICS = {
     "eval_cost": "cost",
     "eval_cost_indicator": "violating steps",
     "train_cost_indicator": "the same, exploring",
+    "train_violations": "in all of training",
     "eval_cost_contact": "any contact",
     "eval_zero_violation_share": "clean episodes",
     "eval_violation_rate": "violation rate",
     "eval_goals": "goals",
     "minutes": "minutes",
 }
+_ROUNDING = 1e-9  # a mean of shares like 0.95 may come out a bit below
 PERCENT_DIGITS = {"eval_zero_violation_share": 1, "eval_violation_rate": 3}
+_WHOLE = ("train_violations",)  # counts of thousands
 REWARD_PARTS = {
     "eval_return": "return",
     "eval_reward_approach": "approach",
@@ -61,23 +64,33 @@ class SafetyRule:
         clean = statistics.scores_of(scores, task, variant, self.clean)
         if not len(cost) or not len(clean):
             return None
-        return bool(cost.mean() <= self.tolerance and clean.mean() >= self.clean_share)
+        return bool(
+            cost.mean() <= self.tolerance + _ROUNDING
+            and clean.mean() >= self.clean_share - _ROUNDING
+        )
 
     def safe_returns(self, scores: pd.DataFrame) -> pd.DataFrame:
-        """`scores` with eval_return set to 0 in every run that is not safe by itself.
+        """`scores` with the eval_return of every run that is not safe by itself set to the worst.
 
-        The paper: "the policy is meaningless if it can not guarantee safety".
+        That is 0, or the lowest return of any run on the task where one is negative: no unsafe run
+        may rank above a safe one. The paper: "the policy is meaningless if it can not guarantee
+        safety".
         """
         keys = ["task", "variant", "seed"]
         wide = scores[scores["metric"].isin([self.cost, self.clean])]
         wide = wide.pivot_table(index=keys, columns="metric", values="value")
         wide = wide.reindex(columns=[self.cost, self.clean])
         unsafe = wide[
-            ~((wide[self.cost] <= self.tolerance) & (wide[self.clean] >= self.clean_share))
+            ~(
+                (wide[self.cost] <= self.tolerance + _ROUNDING)
+                & (wide[self.clean] >= self.clean_share - _ROUNDING)
+            )
         ]
         index = pd.MultiIndex.from_frame(scores[keys])
-        lost = index.isin(unsafe.index) & (scores["metric"] == "eval_return").to_numpy()
-        return scores.assign(value=scores["value"].where(~lost, 0.0))
+        returns = scores["metric"] == "eval_return"
+        lost = index.isin(unsafe.index) & returns.to_numpy()
+        lowest = scores[returns].groupby("task")["value"].min().clip(upper=0.0)
+        return scores.assign(value=scores["value"].where(~lost, scores["task"].map(lowest)))
 
     def __str__(self) -> str:
         return (
@@ -107,6 +120,10 @@ class Table:
     def latex(self) -> str:
         """A LaTeX table environment (booktabs), caption and notes included."""
         head, *body = [[_latex(cell) for cell in row] for row in _cells(self.display)]
+        # An opening bracket after \\ would be read as the optional distance between rows.
+        body = [
+            ["{}" + row[0] if row[0].startswith(("[", "*")) else row[0], *row[1:]] for row in body
+        ]
         rows = [" & ".join(row) + r" \\" for row in body]
         caption = _latex(" ".join([self.caption, *self.notes]))
         return "\n".join(
@@ -158,6 +175,9 @@ def table_one(
             + (f" ({r['baseline']})" if r["baseline"] else "")
             for r in rows
         ],
+        "Difference": [
+            plus_minus(r["difference"], r["difference_low"], r["difference_high"], 2) for r in rows
+        ],
         "Improvement [95% interval]": [
             _percent(r["improvement"], r["improvement_low"], r["improvement_high"]) for r in rows
         ],
@@ -166,13 +186,24 @@ def table_one(
         "Paper: improvement, printed": [f"{r['paper_printed']:.1f}%" for r in rows],
         "Paper: improvement, recomputed": [f"{r['paper_recomputed']:.1f}%" for r in rows],
     }
+    highest, difference, improvement = list(lines.values())[1:4]
+    for column, r in enumerate(rows):
+        if r["baseline_runs"] and not r["baseline"]:
+            highest[column], difference[column], improvement[column] = (
+                "none is safe",
+                ABSENT,
+                ABSENT,
+            )
+        elif r["baseline"] and np.isnan(data["improvement"][column]):
+            improvement[column] = "undefined (baseline ≤ 0)"
     display = pd.DataFrame(
         [[name, *cells] for name, cells in lines.items()], columns=["Expected return", *tasks]
     )
     caption = (
         "Table I. Efficiency of SafeMR against the best safe baseline: final return of the "
         "deterministic policy, mean over seeds with the half width of its 95% t interval; "
-        f"improvement with Fieller's 95% interval. {str(rule).capitalize()}. The best baseline is "
+        "difference with Welch's, improvement with Fieller's 95% interval, which is not bounded "
+        f"where the baseline cannot be told from 0. {str(rule).capitalize()}. The best baseline is "
         "chosen on the runs it is compared with."
     )
     return Table("table1", caption, data, display, missing_notes(missing, tasks, None))
@@ -195,7 +226,7 @@ def full_results(
     data = statistics.summarise(scores[scores["metric"].isin(list(metrics))])
     data = data.sort_values("task", key=_task_order, kind="stable").reset_index(drop=True)
     rows = []
-    for task, variant in _entries(data, missing):
+    for task, variant in entries(data, missing):
         chosen = data[(data["task"] == task) & (data["variant"] == variant)].set_index("metric")
         safe = rule.is_safe(scores, task, variant)
         cells = [_summary_cell(chosen, metric) for metric in metrics]
@@ -204,10 +235,11 @@ def full_results(
     display = pd.DataFrame(rows, columns=["task", "algorithm", "seeds", "safe", *metrics.values()])
     caption = (
         "Full results: final performance of the deterministic policy (mean over the last 10% of "
-        "evaluations), mean over seeds ± half width of the 95% t interval; IQM in brackets. Cost "
-        "is the authors' (pillars: contact steps of the body; hazards: summed depth); any contact "
-        f"counts the robot's nose too. {str(rule).capitalize()}. Scripted controllers see the full "
-        "state and are not learned."
+        "evaluations, on ten fixed layouts), mean over seeds ± half width of the 95% t interval; "
+        "from four seeds on the IQM in brackets. Cost is the authors' (pillars: contact steps of "
+        "the body; hazards: summed depth); any contact counts the robot's nose too; in all of "
+        "training: violating steps of a whole run, whose length differs between the families. "
+        f"{str(rule).capitalize()}. Scripted controllers see the full state and are not learned."
     )
     return Table(name, caption, data, display, missing_notes(missing, None, None))
 
@@ -220,8 +252,8 @@ def push_split(scores: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> 
     caption = (
         "Push returns by part: approach is earned by walking to the box, push by bringing the box "
         "nearer to the goal, the bonus by goals reached. Mean over seeds ± half width of the 95% t "
-        "interval; IQM in brackets. A return near that of touching the box says nothing about "
-        "pushing."
+        "interval; from four seeds on the IQM in brackets. A return near that of touching the box "
+        "says nothing about pushing."
     )
     return Table(table.name, caption, table.data, table.display, table.notes)
 
@@ -236,6 +268,8 @@ def _table_one_row(
     best, best_returns = best_safe_baseline(scores, task, rule, baselines)
     own, other = statistics.mean_interval(ours), statistics.mean_interval(best_returns)
     gain = statistics.improvement_interval(ours, best_returns)
+    gap = statistics.difference_interval(ours, best_returns)
+    tried = [statistics.scores_of(scores, task, v, "eval_return") for v in baselines]
     paper = reference.TABLE_I.get(task)
     return {
         "task": task,
@@ -243,6 +277,8 @@ def _table_one_row(
         "safemr_safe": rule.is_safe(scores, task, reference.METHOD),
         "baseline": best, "baseline_return": other.mean,
         "baseline_low": other.low, "baseline_high": other.high, "baseline_seeds": other.size,
+        "baseline_runs": sum(map(len, tried)),
+        "difference": gap.mean, "difference_low": gap.low, "difference_high": gap.high,
         "improvement": gain.mean, "improvement_low": gain.low, "improvement_high": gain.high,
         "paper_safemr": paper.safemr if paper else np.nan,
         "paper_baseline": paper.best_safe if paper else np.nan,
@@ -270,7 +306,7 @@ def compute(runs: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table
     runs: the runs table (task, variant, seed, steps, cpu_s, wall_s, peak_rss_mb, cpu).
     """
     rows = []
-    for task, variant in _entries(runs, None):
+    for task, variant in entries(runs, None):
         chosen = runs[(runs["task"] == task) & (runs["variant"] == variant)]
         core_s = float(chosen["cpu_s"].sum())
         rows.append(
@@ -327,7 +363,7 @@ def missing_notes(
     return (f"Runs missing: {describe_missing(missing)}.",) if len(missing) else ()
 
 
-def _entries(data: pd.DataFrame, missing: pd.DataFrame | None) -> list[tuple[str, str]]:
+def entries(data: pd.DataFrame, missing: pd.DataFrame | None) -> list[tuple[str, str]]:
     """(task, variant) of every row to print: those with data, then those wholly missing."""
     pairs = list(dict.fromkeys(zip(data["task"], data["variant"], strict=True)))
     if missing is not None:
@@ -354,8 +390,9 @@ def _summary_cell(chosen: pd.DataFrame, metric: str) -> str:
     if metric in PERCENT_DIGITS:
         mean, low, high = 100 * row[["mean", "low", "high"]].to_numpy(float)
         return plus_minus(mean, low, high, PERCENT_DIGITS[metric]) + "%"
-    cell = plus_minus(row["mean"], row["low"], row["high"], 2)
-    return f"{cell} [{row['iqm']:.2f}]" if metric == "eval_return" else cell
+    cell = plus_minus(row["mean"], row["low"], row["high"], 0 if metric in _WHOLE else 2)
+    middle = metric == "eval_return" and row["count"] >= 4  # of fewer, it is the mean
+    return f"{cell} [{row['iqm']:.2f}]" if middle else cell
 
 
 def plus_minus(mean: object, low: object, high: object, digits: int) -> str:
@@ -375,7 +412,7 @@ def _percent(mean: object, low: object, high: object) -> str:
     if np.isnan(lower):
         return f"{value:+.1f}%"
     if np.isinf(lower):
-        return f"{value:+.1f}% [unbounded]"
+        return f"{value:+.1f}% [not bounded]"
     return f"{value:+.1f}% [{lower:+.1f}, {upper:+.1f}]"
 
 

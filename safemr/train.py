@@ -19,8 +19,9 @@ from typing import Any, TextIO
 
 from safemr import records, runs
 from safemr.checkpoints import CHECKPOINT, RunSession
-from safemr.config import WANDB_MODES, typed
+from safemr.config import WANDB_MODES
 from safemr.errors import UserError, tell
+from safemr.strict_yaml import typed
 
 
 def make_envs(task: Mapping[str, Any], num_envs: int) -> Any:

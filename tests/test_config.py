@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from safemr import config, runs
 from safemr.errors import UserError
 from safemr.plan_cache import plan_for
+from safemr.strict_yaml import StrictLoader
 
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT = ROOT / "config/config.yaml"
@@ -30,6 +31,7 @@ VALID: dict[str, Any] = {
     "budget": {"off_policy": 1000, "on_policy": 2000},
     "log_points": 10,
     "evaluation": {"points": 5, "episodes": 2, "seed": 10000},
+    "unseen_layouts": {"episodes": 3, "seed": 20000},
     "task_overrides": {
         "Hazards-0.15-Push": {
             "settings": {"sleep": True},
@@ -120,6 +122,9 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
     ("evaluation", "points"): NOT_POSITIVE,
     ("evaluation", "episodes"): NOT_POSITIVE,
     ("evaluation", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("unseen_layouts",): [*NOT_A_MAPPING, {"seed": 1}, {"episode": 5}],
+    ("unseen_layouts", "episodes"): NOT_POSITIVE,
+    ("unseen_layouts", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
     ("task_overrides",): [
         *NOT_A_MAPPING,
         *({name: {}} for name in ["Pillar-0.15-Goal", *NOT_A_NAME[2:]]),
@@ -334,6 +339,7 @@ CHANGES: list[tuple[tuple[str, ...], Any, int]] = [
     (("sensitivity", "points"), [[0.45, 0.15], [0.5, 0.5]], 1),
     (("outside", "Script", "version"), 2, 4),
     (("evaluation", "episodes"), 3, 14),
+    (("unseen_layouts", "episodes"), 50, 0),
     (("wandb", "mode"), "offline", 0),
     (("safe", "cost_tolerance"), 2.0, 0),
     (("figures_root",), "elsewhere", 0),
@@ -390,7 +396,7 @@ def test_points_make_a_map_when_they_are_all_pairs():
 
 @pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.yaml")), ids=lambda p: p.stem)
 def test_every_shipped_config_is_valid(path: Path) -> None:
-    assert resolve(yaml.load(path.read_text(), config._StrictLoader)).runs
+    assert resolve(yaml.load(path.read_text(), StrictLoader)).runs
 
 
 def test_the_paper_grid_has_170_runs() -> None:

@@ -194,6 +194,17 @@ def test_saving_twice_gives_equal_files(progress, tmp_path):
         assert first.read_bytes() == second.read_bytes()
 
 
+def test_an_unsafe_algorithm_has_a_hollow_mean(progress):
+    final = statistics.final_scores(progress)
+    final.loc[final["metric"] == "eval_cost_indicator", "value"] = 0.0
+    (ax, _) = scores.return_against_cost(final, TASKS, unsafe=[(TASKS[0], "CPO")]).axes
+    means = {line.get_color(): line for line in ax.lines if len(line.get_xdata()) == 1}
+    assert means[style.colour("CPO")].get_markerfacecolor() == "none"
+    assert means[style.colour("SafeMR")].get_markerfacecolor() == style.colour("SafeMR")
+    places = [line.get_xdata()[0] for line in means.values()]
+    assert len(set(places)) == len(places), "at no cost they do not hide each other"
+
+
 def test_the_weight_map_shows_every_point_where_it_belongs(progress):
     axes = figures(progress)["weights"]().axes
     data = sensitivity.weight_map(

@@ -218,3 +218,23 @@ def test_missing_runs_are_listed_in_the_expected_order():
     )
     missing = statistics.missing_runs(expected, expected.iloc[[1]])
     assert list(missing.itertuples(index=False, name=None)) == [("t", "A", 0), ("u", "B", 0)]
+
+
+def test_a_run_expected_twice_is_missing_once():
+    expected = pd.DataFrame({"task": "t", "variant": "v", "seed": [1, 2, 1]})
+    missing = statistics.missing_runs(expected, expected.iloc[:0])
+    assert missing["seed"].tolist() == [1, 2]
+
+
+def test_violations_of_training_are_summed_over_episodes():
+    log = {100: (2, 0.5), 200: (0, np.nan), 300: (4, 2.25)}  # step: episodes, mean violating steps
+    progress = pd.DataFrame(
+        [("t", "v", 0, step, metric, value)
+         for step, values in log.items()
+         for metric, value in zip(("train_episodes", "train_cost_indicator"), values, strict=True)],
+        columns=["task", "variant", "seed", "step", "metric", "value"],
+    )  # fmt: skip
+    (total,) = statistics.training_violations(progress).to_dict("records")
+    assert total == {
+        "task": "t", "variant": "v", "seed": 0, "metric": "train_violations", "value": 10.0
+    }  # fmt: skip

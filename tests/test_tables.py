@@ -107,7 +107,9 @@ def test_written_forms_hold_the_same_numbers(scores, tmp_path, ending):
         data = pd.read_csv(paths["csv"]).set_index(["task", "variant", "metric"])
         assert data.loc[(TASK, "SafeMR", "eval_return"), "iqm"] == pytest.approx(iqm, rel=1e-15)
     else:
-        assert f"[{iqm:.2f}]" in text
+        mean = statistics.mean_interval(np.array(RETURNS[TASK, "SafeMR"])).mean
+        assert f"{mean:.2f} " in text
+        assert "[" not in text, "the IQM of three seeds is their mean"
         assert ("$\\pm$" in text) == (ending == "tex")
 
 
@@ -195,6 +197,54 @@ def test_push_returns_are_split_into_their_parts():
     assert found["scripted: pushes the box"][1] == "2.40 ± 0.00"
 
 
+def test_the_iqm_is_shown_where_it_is_not_the_mean(scores):
+    ours = scores[(scores["variant"] == "SafeMR") & (scores["task"] == TASK)]
+    more = ours[ours["seed"] == 0].assign(seed=3)
+    table = tables.full_results(pd.concat([scores, more]))
+    (cell,) = [row[4] for row in cells(table)[2:] if row[:2] == [TASK, "SafeMR"]]
+    assert cell.endswith("[19.50]")  # of 18.8, 19.5, 19.5, 19.6 the middle two
+
+
+def test_a_share_at_the_limit_is_safe_whatever_its_rounding(scores):
+    ours = (scores["variant"] == "SafeMR") & (scores["metric"] == "eval_zero_violation_share")
+    scores.loc[ours, "value"] = 0.95
+    assert np.mean([0.95] * 3) < 0.95
+    assert tables.SafetyRule().is_safe(scores, TASK, "SafeMR")
+
+
+def test_table_one_tells_no_safe_baseline_from_missing_runs(scores):
+    names = ("JointSIS", "FAC-phih")
+    unsafe = scores["variant"].isin(names) & (scores["metric"] == "eval_cost_indicator")
+    scores.loc[unsafe, "value"] = 9.0
+    rows = {row[0]: row[1] for row in cells(tables.table_one(scores, tasks=[TASK]))[2:]}
+    assert rows["Highest among safe baselines"] == "none is safe"
+    assert rows["Improvement [95% interval]"] == rows["Difference"] == tables.ABSENT
+    nothing = tables.table_one(scores[scores["variant"] == "SafeMR"], tasks=[TASK])
+    assert cells(nothing)[3][1] == "missing"
+
+
+def test_an_improvement_over_a_negative_return_is_undefined_and_the_difference_is_not(scores):
+    safe = (scores["task"] == OTHER) & (scores["variant"] == "JointSIS")
+    scores.loc[safe & (scores["metric"] == "eval_return"), "value"] = [-0.4, -0.5, -0.2]
+    rows = {row[0]: row[1] for row in cells(tables.table_one(scores, tasks=[OTHER]))[2:]}
+    assert rows["Improvement [95% interval]"] == "undefined (baseline ≤ 0)"
+    assert rows["Difference"].startswith("2.07 ± ")
+
+
+def test_latex_does_not_read_a_bracket_as_the_distance_of_rows():
+    frame = pd.DataFrame({"[a, b]": ["[0.35, 0.15]"], "x": ["[1]"]})
+    assert "{}[0.35, 0.15] & [1]" in tables.Table("t", "c", frame, frame).latex()
+
+
+def test_no_unsafe_run_ranks_above_a_safe_one_where_returns_are_negative(scores):
+    on_task = scores["task"] == TASK
+    returns = on_task & (scores["metric"] == "eval_return")
+    scores.loc[returns, "value"] -= 30
+    gated = tables.SafetyRule().safe_returns(scores)
+    lowest = scores.loc[returns, "value"].min()
+    assert statistics.scores_of(gated, TASK, "CPO", "eval_return").tolist() == [lowest] * 3
+
+
 def test_safe_returns_count_unsafe_runs_as_zero(scores):
     gated = tables.SafetyRule().safe_returns(scores)
     assert statistics.scores_of(gated, TASK, "CPO", "eval_return").tolist() == [0, 0, 0]
@@ -268,6 +318,13 @@ def test_unsafe_baselines_and_safe_ones(scores):
     assert verdict("safe_but_lower[FAC-phih]", evidence(safe)) == "refuted"
 
 
+def test_equal_shares_in_every_seed_are_no_interval(scores):
+    scores = with_baselines(scores)
+    for metric, value in (("eval_cost_indicator", 0.3), ("eval_zero_violation_share", 0.9)):
+        scores.loc[(scores["variant"] == "CPO") & (scores["metric"] == metric), "value"] = value
+    assert verdict("unsafe[CPO]", evidence(scores)) == "inconclusive"
+
+
 def test_one_missing_seed_makes_a_claim_inconclusive_and_is_named(scores):
     given = evidence(scores, expected=expected_runs(4))
     (claim,) = [claim for claim in claims.claims((TASK,)) if claim.name == "unsafe[CPO]"]
@@ -316,6 +373,9 @@ def test_aircraft_claims(scores, volumes, missed, expected):
     given = evidence(scores, aircraft=table)
     assert (verdict("conservativeness", given), verdict("coverage", given)) == expected
     assert verdict("handcrafted_coverage", given) == "confirmed"
+    fourth = pd.DataFrame({"task": "Aircraft", "variant": ["SafeMR"], "seed": 3})
+    lacking = replace(given, expected=fourth)
+    assert verdict("conservativeness", lacking) == verdict("coverage", lacking) == "inconclusive"
 
 
 @pytest.mark.parametrize(
@@ -355,6 +415,23 @@ def test_bounded_losses(scores, growth, expected):
     time = np.linspace(0, 1, 60)
     curves = {"critic_loss": np.exp(growth * time), "policy_grad_norm": np.ones(60)}
     assert verdict("bounded", evidence(scores, progress=curve_rows(curves))) == expected
+
+
+@pytest.mark.parametrize("name", ["bounded", "slowest_certificate"])
+def test_what_is_said_of_curves_must_hold_on_every_task(scores, name):
+    time = np.linspace(0, 1, 60)
+    good = {"critic_loss": np.ones(60), "train_return": -np.exp(-time / 0.1),
+            "multiplier_mean": -np.exp(-time / 0.15)}  # fmt: skip
+    good |= {parameter: np.exp(-time / 0.5) for parameter in ("sigma", "k", "n")}
+    bad = {**good, "critic_loss": np.exp(9 * time)}
+    bad |= {parameter: np.exp(-time / 0.02) for parameter in ("sigma", "k", "n")}
+    one, two = curve_rows(good), curve_rows(bad).assign(task=OTHER)
+    for progress, tasks, expected in (
+        (one, (TASK,), "confirmed"),
+        (pd.concat([one, two]), (TASK, OTHER), "refuted"),
+        (one, (TASK, OTHER), "inconclusive"),
+    ):
+        assert verdict(name, evidence(scores, progress=progress, tasks=tasks)) == expected
 
 
 def test_a_claims_table_without_any_run_is_complete_and_inconclusive():

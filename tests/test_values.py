@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from safemr import config, runs, train
+from safemr import runs, strict_yaml, train
 from safemr.errors import UserError
 
 
@@ -22,7 +22,7 @@ from safemr.errors import UserError
     ],
 )
 def test_values_of_a_command_line(text: str, value: Any) -> None:
-    assert config.typed(text) == value
+    assert strict_yaml.typed(text) == value
     assert train._override(f"gamma={text}") == ("gamma", value)
 
 

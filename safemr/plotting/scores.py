@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,20 +17,32 @@ from safemr.statistics import Aggregates, Estimate
 
 
 def draw_return_against_cost(
-    points: pd.DataFrame, ax: Axes, *, tolerance: float | None = None
+    points: pd.DataFrame,
+    ax: Axes,
+    *,
+    tolerance: float | None = None,
+    unsafe: Collection[str] = (),
 ) -> Axes:
-    """One small marker a seed, the mean over seeds large; points: variant, seed, cost, value."""
+    """One small marker a seed, the mean over seeds large, and hollow if `unsafe`.
+
+    points: variant, seed, cost, return. Costs of 0 are shifted a little, each variant its own way,
+    or most would lie upon each other.
+    """
     if tolerance is not None:
         ax.axvspan(-1, tolerance, color="#009E73", alpha=0.08, lw=0, zorder=0)
-    for variant in style.ordered(points["variant"].unique()):
+    variants = style.ordered(points["variant"].unique())
+    for order, variant in enumerate(reversed(variants)):  # the first of the legend on top
         run = points[points["variant"] == variant]
-        look: dict[str, Any] = {
-            "color": style.colour(variant),
-            "marker": style.marker(variant),
-            "ls": "none",
-        }
-        ax.plot(run["cost"], run["return"], ms=2.6, alpha=0.55, mew=0, **look)
-        ax.plot(run["cost"].mean(), run["return"].mean(), ms=6, mec="white", mew=0.6, **look)
+        tint = style.colour(variant)
+        look: dict[str, Any] = {"color": tint, "marker": style.marker(variant), "ls": "none"}
+        side = 0.13 * (order / max(len(variants) - 1, 1) - 0.5)
+        middle = run["cost"].mean()
+        fill = {"mfc": "none", "mec": tint, "mew": 1.1} if variant in unsafe else {"mec": "white"}
+        ax.plot(middle + side * (middle < 0.05), run["return"].mean(), ms=6, zorder=2 + order / 100,
+                **{"mew": 0.6, **look, **fill})  # fmt: skip
+        shifted = run["cost"] + side * (run["cost"] < 0.05)
+        ax.plot(shifted, run["return"], ms=2.6, alpha=0.75, zorder=3 + order / 100,
+                **{"mec": "white", "mew": 0.25, **look})  # fmt: skip
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
     right = max(1.6 * points["cost"].max(), 10.0) if len(points) else 10.0
     ax.set_xlim(-0.12, right)
@@ -48,8 +60,12 @@ def return_against_cost(
     cost: str = "eval_cost_indicator",
     cost_name: str = "violating steps an episode",
     tolerance: float | None = None,
+    unsafe: Collection[tuple[str, str]] = (),
 ) -> Figure:
-    """Return against cost of the final policies, one panel a task; the safe region is shaded."""
+    """Return against cost of the final policies, one panel a task.
+
+    Costs up to `tolerance` are shaded; `unsafe` (task, variant) have hollow means.
+    """
     wide = scores[scores["metric"].isin(["eval_return", cost])].pivot_table(
         index=["task", "variant", "seed"], columns="metric", values="value"
     )
@@ -57,7 +73,9 @@ def return_against_cost(
     figure = style.new_figure(style.TEXT_WIDTH, 2.1)
     axes = figure.subplots(1, len(tasks), squeeze=False)[0]
     for ax, task in zip(axes, tasks, strict=True):
-        draw_return_against_cost(wide[wide["task"] == task], ax, tolerance=tolerance)
+        hollow = [variant for where, variant in unsafe if where == task]
+        chosen = wide[wide["task"] == task]
+        draw_return_against_cost(chosen, ax, tolerance=tolerance, unsafe=hollow)
         if not (wide["task"] == task).any():
             _say(ax, "no record")
         ax.set_title(task)
@@ -103,17 +121,25 @@ def draw_intervals(estimates: Mapping[str, Estimate], ax: Axes, *, neutral: floa
 
 @style.styled
 def aggregate_scores(
-    aggregates: Aggregates, *, method: str = "SafeMR", name: str = "return"
+    aggregates: Aggregates,
+    *,
+    method: str = "SafeMR",
+    name: str = "return",
+    absent: Sequence[str] = (),
 ) -> Figure:
     """Performance profiles over all tasks, IQM of the normalised score, probability of improvement.
 
-    aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn.
+    aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn, but
+    named if it is among `absent`.
     """
     figure = style.new_figure(style.TEXT_WIDTH, 2.3)
     left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
     draw_profiles(aggregates.profiles, left)
     if not aggregates.profiles:
         _say(left, "no algorithm has runs on every task")
+    if absent:
+        names = ", ".join(map(style.label, style.ordered(absent)))
+        left.set_title(f"runs missing: {names}", fontsize="small", color="0.4", style="italic")
     left.set_xlabel(rf"normalised {name} $\tau$ (paper's SafeMR: 1)")
     draw_intervals(aggregates.iqm, middle, neutral=1.0)
     middle.set_xlabel(f"IQM of normalised {name}")

@@ -81,7 +81,7 @@ rule claims:
     threads: 1
     params:
         **BUDGET,
-        expected=expected((*PLAN.navigation, *PLAN.sensitivity, *PLAN.outside)),
+        expected=expected((*PLAN.navigation, *PLAN.sensitivity, *PLAN.aircraft, *PLAN.outside)),
         points={label: list(point) for label, point in PLAN.points.items()},
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,

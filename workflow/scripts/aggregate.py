@@ -14,5 +14,10 @@ progress.to_csv(
     snakemake.output.progress, index=False, compression={"method": "gzip", "compresslevel": 1}
 )
 minutes = runs[["task", "variant", "seed"]].assign(metric="minutes", value=runs["cpu_s"] / 60)
-scores = pd.concat([statistics.final_scores(progress), minutes.dropna()], ignore_index=True)
+parts = [
+    statistics.final_scores(progress),
+    statistics.training_violations(progress),
+    minutes.dropna(),
+]
+scores = pd.concat(parts, ignore_index=True)
 scores.to_csv(snakemake.output.scores, index=False)

@@ -1,0 +1,52 @@
+# The final policies on layouts that no run was evaluated on: ten fixed layouts say little of others.
+FLOWN = {}
+for run in (*PLAN.navigation, *PLAN.sensitivity):
+    if run in RECORDED and run.task in ROBOT_TASKS:
+        FLOWN.setdefault(run.task, {})[run.path.as_posix()] = run
+
+
+rule unseen_layouts:
+    input:
+        lambda wildcards: record_files(FLOWN[wildcards.task].values()),
+    output:
+        f"{SUMMARY}/unseen_layouts/{{task}}.csv",
+    log:
+        f"{LOGS}/unseen_layouts/{{task}}.log",
+    wildcard_constraints:
+        task=one_of(FLOWN),
+    threads: 1
+    params:
+        root=RESULTS,
+        folders=lambda wildcards: list(FLOWN[wildcards.task]),
+        episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
+        seed=CONFIG.unseen_layouts and CONFIG.unseen_layouts.seed,
+    message:
+        "Flying the final policies of {wildcards.task} on {params.episodes} unseen layouts"
+    script:
+        "../scripts/unseen_layouts.py"
+
+
+rule unseen_table:
+    input:
+        flown=expand(rules.unseen_layouts.output[0], task=FLOWN),
+        scores=rules.aggregate.output.scores,
+    output:
+        table=expand(f"{RESULTS}/tables/unseen_layouts.{{end}}", end=["csv", "tex"]),
+        markdown=report(
+            f"{RESULTS}/tables/unseen_layouts.md",
+            caption="../report/unseen_layouts.rst",
+            category="Tables",
+        ),
+    log:
+        f"{LOGS}/unseen_table.log",
+    threads: 1
+    params:
+        episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
+        tolerance=CONFIG.cost_tolerance,
+        clean_share=CONFIG.zero_violation_share,
+    script:
+        "../scripts/unseen_table.py"
+
+
+if CONFIG.unseen_layouts and FLOWN:
+    TARGETS += rules.unseen_table.output

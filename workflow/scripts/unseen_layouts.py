@@ -1,0 +1,17 @@
+"""Scores of one task's final policies on layouts that no run was evaluated on."""
+
+from pathlib import Path
+
+from safemr import unseen
+from safemr.cli import reported_errors
+from safemr.measurements import Measurements
+
+params = snakemake.params
+with reported_errors():
+    scores = unseen.measured_scores(
+        Measurements(params.root),
+        [Path(params.root, folder) for folder in params.folders],
+        episodes=params.episodes,
+        seed=params.seed,
+    )
+scores.to_csv(snakemake.output[0], index=False)
