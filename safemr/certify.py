@@ -191,7 +191,7 @@ def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
             "infeasible": [_share(share, data["states"][i])
                            for i, share in enumerate(data["infeasible_share"])],
             "leaking": [f"{100 * share:.3f}%" for share in data["leak_share"]],
-            "worst margin": [f"{margin:+.4f}" for margin in data["worst_margin"]],
+            "least g at the worst state": [f"{margin:+.4f}" for margin in data["worst_margin"]],
             "simulator agrees": data["simulator_agrees"],
         }
     )  # fmt: skip
