@@ -120,5 +120,7 @@ def test_the_table_counts_episodes_with_violations() -> None:
     assert math.isnan(cpo["change"])
     assert ours["upper_bound"] == pytest.approx(1 - 0.05 ** (1 / 60))  # the rule of three
     assert stats.binom.cdf(6, 60, cpo["upper_bound"]) == pytest.approx(0.05)
+    assert cpo["behind"] == pytest.approx(-9.0)
+    assert math.isnan(ours["behind"])
     interval = statistics.mean_interval(np.array([10.0, 11.0, 12.0]))
     assert (ours["return_low"], ours["return_high"]) == interval[1:3]
