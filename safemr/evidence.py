@@ -190,5 +190,5 @@ def describe(estimate: Estimate) -> str:
         return "–"
     if np.isnan(estimate.low) or estimate.low == estimate.high:
         equal = estimate.low == estimate.high and estimate.size > 1
-        return f"{estimate.mean:.3g}" + " in every seed" * equal
+        return f"{estimate.mean:.3g}{' in every seed' if equal else ''}"
     return f"{estimate.mean:.3g} [{estimate.low:.3g}, {estimate.high:.3g}]"

@@ -434,6 +434,13 @@ def test_what_is_said_of_curves_must_hold_on_every_task(scores, name):
         assert verdict(name, evidence(scores, progress=progress, tasks=tasks)) == expected
 
 
+def test_the_claims_table_says_where_seeds_agree_exactly(scores):
+    table = claims.claims_table(evidence(with_baselines(scores)))
+    shown = dict(zip(table.data["claim"], table.display["ours [95% interval]"], strict=True))
+    assert shown["zero_violations"] == "1 in every seed"
+    assert re.fullmatch(r"[\d.]+ \[[\d.]+, [\d.]+\]", shown[f"highest_return[{TASK}]"])
+
+
 def test_a_claims_table_without_any_run_is_complete_and_inconclusive():
     nothing = evidence(score_rows().iloc[:0], tasks=reference.TASKS)
     table = claims.claims_table(nothing)
