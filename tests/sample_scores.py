@@ -30,3 +30,9 @@ def score_rows() -> pd.DataFrame:
             ):
                 rows.append((task, variant, seed, metric, score))
     return pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+
+
+def expected_runs(seeds: int = 3) -> pd.DataFrame:
+    """A grid (task, variant, seed) with this many seeds of everything in `RETURNS`."""
+    rows = [(task, variant, seed) for task, variant in RETURNS for seed in range(seeds)]
+    return pd.DataFrame(rows, columns=["task", "variant", "seed"])

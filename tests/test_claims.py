@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from sample_scores import OTHER, RETURNS, TASK, score_rows
+from sample_scores import OTHER, TASK, expected_runs, score_rows
 
 from safemr import claims, reference
 from safemr.evidence import Evidence
@@ -18,11 +18,6 @@ from safemr.evidence import Evidence
 @pytest.fixture
 def scores() -> pd.DataFrame:
     return score_rows()
-
-
-def expected_runs(seeds: int = 3) -> pd.DataFrame:
-    rows = [(task, variant, seed) for task, variant in RETURNS for seed in range(seeds)]
-    return pd.DataFrame(rows, columns=["task", "variant", "seed"])
 
 
 def evidence(scores: pd.DataFrame, **changes: object) -> Evidence:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from sample_scores import OTHER, RETURNS, TASK, score_rows
+from sample_scores import OTHER, RETURNS, TASK, expected_runs, score_rows
 from scipy import stats
 
 from safemr import reference, sensitivity, statistics, tables
@@ -14,11 +14,6 @@ from safemr import reference, sensitivity, statistics, tables
 @pytest.fixture
 def scores() -> pd.DataFrame:
     return score_rows()
-
-
-def expected_runs(seeds: int = 3) -> pd.DataFrame:
-    rows = [(task, variant, seed) for task, variant in RETURNS for seed in range(seeds)]
-    return pd.DataFrame(rows, columns=["task", "variant", "seed"])
 
 
 def cells(table: tables.Table) -> list[list[str]]:
