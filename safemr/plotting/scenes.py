@@ -53,8 +53,7 @@ def trajectories(
             _draw_path(data, episode, steps, ax, draw_scene, style.colour(variant))
             total = float(data["reward"][:steps, episode].sum())
             _frame(ax, f"return {total:.1f}".replace("-", "\N{MINUS SIGN}"))
-            shown = [{**data, "robot": data["robot"][: steps + 1]} for data in recorded.values()]
-            view = _view(shown, episode)
+            view = _view(list(recorded.values()), episode, steps)
             ax.set(xlim=view[0], ylim=view[1])
         row[0].set_ylabel(style.label(variant), color=style.colour(variant))
     return figure
@@ -133,13 +132,20 @@ def _draw_path(
         ax.plot(box[:, 0], box[:, 1], color="#8a6a00", lw=0.8, ls=(0, (2, 1)), zorder=6)
 
 
-def _view(recordings: Sequence[Arrays], episode: int) -> NDArray[np.float64]:
-    """[2, 2] limits of x and y: the task's square, widened by up to half to hold every robot."""
-    points = np.concatenate([data["robot"][:, episode, :2] for data in recordings])
+def _view(
+    recordings: Sequence[Arrays], episode: int, steps: int | None = None
+) -> NDArray[np.float64]:
+    """[2, 2] limits of x and y: the task's square, widened by up to half to hold what moves."""
     extent = float(recordings[0]["extent"])
-    low = np.clip(points.min(0) - 0.2, -1.5 * extent, -extent)
-    high = np.clip(points.max(0) + 0.2, extent, 1.5 * extent)
-    return np.stack([low, high], -1)
+    low, high = np.full(2, -extent), np.full(2, extent)
+    end = None if steps is None else steps + 1
+    for data in recordings:
+        for name, margin in (("robot", 0.2), ("box", 0.4)):
+            points = data[name][:end, episode, :2]
+            if points.size and not np.isnan(points).all():
+                low = np.fmin(low, np.nanmin(points, 0) - margin)
+                high = np.fmax(high, np.nanmax(points, 0) + margin)
+    return np.stack([np.maximum(low, -1.5 * extent), np.minimum(high, 1.5 * extent)], -1)
 
 
 @style.styled
