@@ -287,6 +287,16 @@ def draw_nothing(ax, scene, trajectory=None):
     return ax
 
 
+def test_the_view_holds_the_box_that_was_pushed_out_of_the_square():
+    pushed = recording(0.0)
+    pushed["box"][:] = 0.0
+    pushed["box"][:11, 0, 1] = 2.1
+    pushed["box"][11:, 0, 1] = 2.9  # after the steps that are drawn
+    figure = scenes.trajectories({"SafeMR": pushed}, draw_nothing, steps=10)
+    np.testing.assert_allclose(figure.axes[0].get_ylim(), (-2.0, 2.5), atol=1e-6)
+    np.testing.assert_allclose(figure.axes[1].get_ylim(), (-2.0, 2.0))
+
+
 def test_trajectories_state_the_return_and_draw_the_path(tmp_path):
     path = tmp_path / "rollouts.npz"
     data.save(path, recording(0.0))
