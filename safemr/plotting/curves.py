@@ -38,7 +38,8 @@ def draw_curves(
         reach = 0.5 * max(top - bottom, 1e-3)
         ends = curves[["low", "high"]].fillna({"low": bottom, "high": top})
         low, high = max(bottom - reach, ends["low"].min()), min(top + reach, ends["high"].max())
-        ax.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+        margin = 0.05 * max(high - low, 1e-3)  # all costs of a safe method are 0
+        ax.set_ylim(low - margin, high + margin)
     ax.margins(x=0)
     ax.set_xlim(left=0)
     return ax
