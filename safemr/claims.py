@@ -1,7 +1,8 @@
-"""The paper's claims, judged: one rule a claim, computed from records, written before the runs.
+"""The paper's claims, judged: one rule a claim, computed from records.
 
 A rule turns the evidence into a `Finding`: our number with its 95% interval, a verdict, and the
-reason. docs/claims.md states the rules in words. Common to all: a verdict needs every run of the
+reason. docs/claims.md states the rules in words, and which of them are younger than the first
+reported run. Common to all: a verdict needs every run of the
 grid that it speaks about, else it is "inconclusive: runs missing: ..." (a claim about all tasks can
 be refuted before by one of them); an interval that contains the threshold is inconclusive; and few
 seeds support 95% intervals, not corrections for the number of claims.
@@ -111,8 +112,8 @@ def highest_safe_return(task: str, evidence: Evidence) -> Finding:
 def zero_violations(evidence: Evidence) -> Finding:
     """Share of final evaluation episodes without any violation, SafeMR, each task.
 
-    Confirmed if it is 1 in every seed (none observed; not a proof); refuted if its interval ends
-    below 1 or its mean is below the safety rule's share; else open.
+    Confirmed if it is 1 in every seed (none observed; not a proof), else refuted: one violation
+    contradicts zero, whatever the interval of the share.
     """
 
     def judge(task: str) -> Finding:
@@ -121,9 +122,8 @@ def zero_violations(evidence: Evidence) -> Finding:
         shown = f"clean share {describe(estimate)}"
         if (shares == 1).all():
             return Finding(estimate, "confirmed", f"{shown}, no violation observed")
-        if estimate.high < 1 or estimate.mean < evidence.rule.clean_share:
-            return Finding(estimate, "refuted", shown)
-        return Finding(estimate, "inconclusive", f"{shown}: near one, not one")
+        seeds = f"violations in {(shares < 1).sum()} of {len(shares)} seeds"
+        return Finding(estimate, "refuted", f"{shown}, {seeds}")
 
     return on_every_task(evidence, [reference.METHOD], judge)
 
@@ -149,6 +149,18 @@ def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
         return Finding(cost, "inconclusive", f"{shown}: unsafe on average only")
 
     return on_every_task(evidence, [variant], judge)
+
+
+def higher_than_ours(variant: str, evidence: Evidence) -> Finding:
+    """The algorithm's return exceeds SafeMR's on every task (Welch interval above 0)."""
+    names = (variant, reference.METHOD)
+
+    def judge(task: str) -> Finding:
+        returns = [evidence.of(task, name, "eval_return") for name in names]
+        gap = statistics.difference_interval(returns[0], returns[1])
+        return by_interval(gap, 0.0, f"{variant} - SafeMR")
+
+    return on_every_task(evidence, names, judge)
 
 
 def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding:
@@ -356,6 +368,14 @@ def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
     ]  # fmt: skip
     listed += [
         Claim(
+            f"higher_return[{variant}]", f"{variant} has a higher return than SafeMR",
+            "difference of final returns, the task that decides", "return_against_cost",
+            partial(higher_than_ours, variant),
+        )
+        for variant in (*reference.CMDP_BASELINES, "FAC-phi0")
+    ]  # fmt: skip
+    listed += [
+        Claim(
             f"safe_but_lower[{variant}]",
             f"{variant} is safe{where} but has lower return than SafeMR",
             "difference of final returns, the task that decides", "return_against_cost",
@@ -425,8 +445,8 @@ def claims_table(evidence: Evidence) -> Table:
         }
     )  # fmt: skip
     caption = (
-        "Claims of the paper and what these runs say of them, by rules fixed before the reported "
-        "seeds were run and made stricter since (docs/claims.md). "
+        "Claims of the paper and what these runs say of them, by rules of which docs/claims.md "
+        "says which were changed or added after the first reported run. "
         f"{str(evidence.rule).capitalize()}."
     )
     return Table("claims", caption, data, display)

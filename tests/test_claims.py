@@ -56,7 +56,7 @@ def test_an_unsafe_method_cannot_have_the_highest_safe_return(scores):
 
 @pytest.mark.parametrize(
     ("shares", "expected"),
-    [([1.0, 1.0, 1.0], "confirmed"), ([1.0, 1.0, 0.98], "inconclusive"),
+    [([1.0, 1.0, 1.0], "confirmed"), ([1.0, 1.0, 0.98], "refuted"),
      ([0.9, 0.93, 0.96], "refuted"), ([0.98, 0.981, 0.979], "refuted")],
 )  # fmt: skip
 def test_zero_violations(scores, shares, expected):
@@ -73,6 +73,17 @@ def test_unsafe_baselines_and_safe_ones(scores):
     safe = scores.replace({"variant": {"FAC-phih": "CPO", "CPO": "FAC-phih"}})
     assert verdict("unsafe[CPO]", evidence(safe)) == "refuted"
     assert verdict("safe_but_lower[FAC-phih]", evidence(safe)) == "refuted"
+
+
+@pytest.mark.parametrize(
+    ("shift", "expected"), [(9.0, "confirmed"), (0.0, "inconclusive"), (-9.0, "refuted")]
+)
+def test_a_higher_return_is_one_on_every_task(scores, shift, expected):
+    ours = scores[(scores["variant"] == "SafeMR") & (scores["task"] == TASK)]
+    theirs = ours.assign(variant="PPO-L")
+    theirs.loc[theirs["metric"] == "eval_return", "value"] += shift
+    given = evidence(pd.concat([scores, theirs]))
+    assert verdict("higher_return[PPO-L]", given) == expected
 
 
 def test_equal_shares_in_every_seed_are_no_interval(scores):
