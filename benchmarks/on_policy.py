@@ -2,12 +2,13 @@
 
     python -m benchmarks.on_policy [--task Pillars-0.15-Goal] [--epochs 3] [--output FILE.csv]
 
-Settings: ``grid`` are the defaults of each algorithm's Config (what config/config.yaml trains with);
-``published`` restores the passes and network of safety-starter-agents and of the JointSIS authors'
-comparison; ``omnisafe`` is PPO-Lagrangian with the network, epoch and number of passes of OmniSafe
-0.5.0 (64x64, 20,000 steps, at most 40 passes) and larger minibatches; OmniSafe's own rate on
-SafetyPointGoal1 was about 140 steps/s on one core of a machine of this kind. Passes are those that
-were made, after PPO's early stop. One thread; process CPU time, which other programs disturb less.
+Settings: ``grid`` are the defaults of each algorithm's Config (what config/config.yaml trains
+with); ``published`` restores the passes and network of safety-starter-agents and of the JointSIS
+authors' comparison; ``omnisafe`` is PPO-Lagrangian with the network, epoch and number of passes of
+OmniSafe 0.5.0 (64x64, 20,000 steps, at most 40 passes) and larger minibatches; OmniSafe's own rate
+on SafetyPointGoal1 was about 140 steps/s on one core of a machine of this kind. Passes are those
+that were made, after PPO's early stop. One thread; process CPU time, which other programs disturb
+less.
 """
 
 from __future__ import annotations

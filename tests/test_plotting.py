@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,12 +12,14 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from safemr import reference, sensitivity, statistics
+from safemr import config, reference, sensitivity, statistics
 from safemr.errors import UserError
 from safemr.plotting import certificate, curves, data, scenes, scores, style
+from safemr.reference import Zeta
 
 TASKS = ("Pillars-0.15-Goal", "Hazards-0.15-Push")
 D_MIN = 0.25
+CONFIGS = Path(__file__).parents[1] / "config"
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +50,25 @@ def test_algorithms_have_distinct_colours_and_unknown_ones_a_stable_one():
     assert len(looks) == len(names)
     assert style.colour("my method") == style.colour("my method")
     assert style.colour("my method") not in {style.colour(name) for name in names}
+
+
+def test_the_shipped_variants_have_distinct_looks():
+    names = list(config.load([CONFIGS / "config.yaml", CONFIGS / "variants.yaml"]).algorithms)
+    tints = np.array([luminance(style.colour(name)) for name in names])
+    gaps = np.abs(tints[:, None] - tints[None]).sum(-1) + 3 * np.eye(len(names))
+    assert gaps.min() > 0.3
+    assert len({style.marker(name) for name in names}) == len(names)
+
+
+def test_the_certificate_check_draws_every_certificate():
+    names = [f"SafeMR[{a},0.15] (seed 0)" for a in range(20)] + ["SafeMR (seed 0)"]
+    margins = pd.DataFrame({"distance": [1.0, 1.0], "bearing": [0.0, 1.0], "margin": [-1.0, 1.0]})
+    margins = pd.concat([margins, margins.assign(distance=2.0)])
+    zetas = {name: Zeta(0.1 + 0.01 * i, 1.0, 2.0) for i, name in enumerate(names)}
+    figure = certificate.certificate_check(zetas, 0.25, margins, names[-1])
+    solid = [line for line in figure.axes[0].lines if line.get_label() in names]
+    assert [line.get_label() for line in solid] == names
+    assert solid[-1].get_color() == style.colour("SafeMR")
 
 
 def test_order_is_the_papers_then_alphabetical():

@@ -56,6 +56,36 @@ def test_table_one_names_the_best_safe_baseline_and_the_papers_arithmetic(scores
     assert "at most 1 violating step" in table.caption
 
 
+def test_a_baseline_that_is_added_counts_in_table_one(scores):
+    better = scores[(scores["variant"] == "JointSIS") & (scores["task"] == TASK)].copy()
+    better.loc[better["metric"] == "eval_return", "value"] += 10
+    table = tables.table_one(
+        pd.concat([scores, better.assign(variant="Mine")]), tasks=[TASK],
+        baselines=["JointSIS", "Mine"],
+    )  # fmt: skip
+    assert table.data["baseline"].tolist() == ["Mine"]
+    assert table.data["difference"][0] < 0
+
+
+def test_differences_compare_every_two_algorithms_of_a_task_once(scores):
+    table = tables.differences(scores)
+    pairs = table.data.set_index(["task", "variant", "other"])
+    assert len(pairs) == 5 * 4 // 2 + 1
+    gap = pairs.loc[(TASK, "JointSIS", "SafeMR")]
+    welch = stats.ttest_ind(RETURNS[TASK, "JointSIS"], RETURNS[TASK, "SafeMR"], equal_var=False)
+    assert gap["low"] == pytest.approx(welch.confidence_interval().low)
+    assert gap["high"] == pytest.approx(welch.confidence_interval().high)
+    header, _, *rows = cells(table)
+    shown = {row[1]: dict(zip(header, row, strict=True)) for row in rows if row[0] == TASK}
+    half = gap["high"] - gap["difference"]
+    assert shown["JointSIS"]["SafeMR"] == f"{gap['difference']:.2f} ± {half:.2f} †"
+    assert "SafeMR" not in shown  # every pair once
+    assert shown["FAC-phi0"]["CPO"] != ""
+    assert shown["CPO"]["CPO"] == ""
+    (hazards,) = [row for row in rows if row[:2] == [OTHER, "JointSIS"]]
+    assert "†" not in hazards[2]
+
+
 def test_only_the_first_printed_improvement_of_the_paper_is_wrong():
     wrong = [t for t, r in reference.TABLE_I.items()
              if abs(r.printed_improvement - r.improvement) > 0.06]  # fmt: skip

@@ -22,7 +22,8 @@ from safemr.reference import Zeta
 Array = NDArray[np.float64]
 
 ROBOT = PointRobot()
-_SHADES = ("#D55E00", "#7A2E00", "#F2A36B", "#E69F00", "#555555", "#0072B2", "#009E73", "#CC79A7")
+_PAPER = ("#000000", "#7A7A7A", "#B5B5B5")  # the paper's three sets
+_HANDCRAFTED = {"phi_0": "FAC-phi0", "phi_h": "FAC-phih"}
 
 
 # --- Fig. "energy": the energy function and the safe set -----------------------------------------
@@ -172,7 +173,12 @@ def draw_requirement(zetas: Mapping[str, Zeta], d_min: float, ax: Axes) -> Axes:
         ax.text(place, low, f"available: {braking}", va=where, rotation_mode="anchor",
                 rotation=np.degrees(np.arctan((high - low) / 0.1)),
                 transform_rotates_text=True)  # fmt: skip
-    for (name, zeta), tint in zip(zetas.items(), _SHADES, strict=False):
+    papers = iter(_PAPER)
+    for given, zeta in zetas.items():
+        name = _math(given)
+        variant = _HANDCRAFTED.get(given, given.partition(" (")[0])
+        paper = given.startswith("paper") and next(papers, None)
+        tint = paper or style.colour(variant)
         if zeta.k > 0:
             ax.plot(u, radial_requirement(zeta, d_min, u, "inside"), color=tint, label=name)
             ax.plot(u, radial_requirement(zeta, d_min, u, "outside"), color=tint, ls="--", lw=0.8)
@@ -180,7 +186,8 @@ def draw_requirement(zetas: Mapping[str, Zeta], d_min: float, ax: Axes) -> Axes:
             ax.plot([], [], ls="none", label=f"{name}: no finite value ($k=0$)")
     ax.plot([], [], color="0.5", lw=0.8, ls="--", label=r"dashed: $C=\sigma+d_{\min}^n$")
     ax.set(xlabel="closing speed $u$ (m/s)", ylabel="radial deceleration (m/s$^2$)")
-    ax.set(xlim=(0, ROBOT.max_speed), ylim=(0, 8.2))
+    rows = min((len(zetas) + 2) // 2, 10)  # of the legend above the lines
+    ax.set(xlim=(0, ROBOT.max_speed), ylim=(0, max(8.2, 5.9 / (1 - 0.07 * rows))))
     ax.legend(loc="upper left", ncols=2, columnspacing=1.0)
     return ax
 
@@ -211,7 +218,6 @@ def certificate_check(
     """Analytic condition for several certificates, and the searched margins of one of them."""
     figure = style.new_figure(style.TEXT_WIDTH, 2.7)
     left, right = figure.subplots(1, 2)
-    zetas = {_math(name): zeta for name, zeta in zetas.items()}
     draw_requirement(zetas, d_min, left)
     draw_margin_map(margins, right)
     right.set_title(_math(mapped))

@@ -264,7 +264,5 @@ def _legend(figure: Figure, variants: Sequence[str]) -> None:
         Line2D([], [], color=style.colour(v), ls=style.line_style(v), label=style.label(v))
         for v in variants
     ]
-    # As many columns as the longest name leaves room for: what does not fit would be cut off.
-    longest = max((len(v) for v in variants), default=1)
-    columns = max(1, min(len(handles), 8, 96 // (longest + 5)))
+    columns = style.legend_columns(variants)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns)

@@ -25,8 +25,8 @@ def draw_return_against_cost(
 ) -> Axes:
     """One small marker a seed, the mean over seeds large, and hollow if `unsafe`.
 
-    points: variant, seed, cost, return. Costs of 0 are spread around 0, the variants that have any side
-    by side, or most would lie upon each other.
+    points: variant, seed, cost, return. Costs of 0 are spread around 0, the variants that have
+    any side by side, or most would lie upon each other.
     """
     if tolerance is not None:
         ax.axvspan(-1, tolerance, color="#009E73", alpha=0.08, lw=0, zorder=0)
@@ -83,12 +83,14 @@ def return_against_cost(
         ax.set_title(task)
         ax.set_xlabel(cost_name)
     axes[0].set_ylabel("final return")
+    variants = style.ordered(wide["variant"].unique())
     handles = [
         Line2D([], [], color=style.colour(v), marker=style.marker(v), ls="none", ms=4,
                label=style.label(v))
-        for v in style.ordered(wide["variant"].unique())
+        for v in variants
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=8)
+    columns = style.legend_columns(variants)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -155,7 +157,8 @@ def aggregate_scores(
         for v in style.ordered(aggregates.profiles)
     ]
     if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=8)
+        columns = style.legend_columns(aggregates.profiles)
+        figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     return figure
 
 

@@ -49,6 +49,7 @@ RC: dict[str, Any] = {
 # Okabe-Ito colours: distinct under the common colour-vision deficiencies. The line style tells the
 # families apart in grey: certificate learners solid, CMDP baselines dashed, fixed energies dotted.
 _SOLID, _DASHED, _DOTTED = "-", (0, (4, 1.5)), (0, (1, 1.2))
+_DASH_DOTTED = (0, (4, 1.2, 1, 1.2))
 _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, marker, mathtext
     "SafeMR": ("#D55E00", _SOLID, "o", "SafeMR"),
     "JointSIS": ("#0072B2", _SOLID, "s", "JointSIS"),
@@ -58,6 +59,13 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
     "FAC-phi0": ("#555555", _DOTTED, "P", r"FAC-$\phi_0$"),
     "FAC-phih": ("#E69F00", _DOTTED, "X", r"FAC-$\phi_h$"),
     "SAC-L": ("#000000", _DASHED, "*", "SAC-L"),
+    # config/variants.yaml
+    "SafeMR-literal": ("#882255", _DASH_DOTTED, ">", "SafeMR-literal"),
+    "SafeMR-floor-0.02": ("#999933", _DASH_DOTTED, "h", "SafeMR-floor-0.02"),
+    "SafeMR-floor-0": ("#CC6677", _DASH_DOTTED, "p", "SafeMR-floor-0"),
+    "SafeMR-replay": ("#117733", _DASH_DOTTED, "*", "SafeMR-replay"),
+    "JointSIS-literal": ("#332288", _DASH_DOTTED, "<", "JointSIS-literal"),
+    "JointSIS-released": ("#88CCEE", _DASH_DOTTED, "d", "JointSIS-released"),
 }
 # Tol's "muted" colours for variants that nobody planned.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")
@@ -78,7 +86,7 @@ def colour(variant: str) -> str:
 def line_style(variant: str) -> Any:
     """Matplotlib line style of the variant's family (unknown names: dash-dotted)."""
     known = _ALGORITHMS.get(variant)
-    return known[1] if known else (0, (4, 1.2, 1, 1.2))
+    return known[1] if known else _DASH_DOTTED
 
 
 def member_look(index: int) -> tuple[str, Any]:
@@ -104,6 +112,12 @@ def ordered(variants: Iterable[str]) -> list[str]:
     """Known algorithms in the paper's order, then the others by name."""
     rank = {name: index for index, name in enumerate(_ALGORITHMS)}
     return sorted(set(variants), key=lambda name: (rank.get(name, len(rank)), name))
+
+
+def legend_columns(variants: Iterable[str]) -> int:
+    """As many columns as the longest name leaves room for: what does not fit would be cut off."""
+    lengths = [len(variant) for variant in variants]
+    return max(1, min(len(lengths), 8, 96 // (max(lengths, default=1) + 5)))
 
 
 def new_figure(width: float, height: float) -> Figure:

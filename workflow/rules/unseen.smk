@@ -31,11 +31,18 @@ rule unseen_table:
         flown=expand(rules.unseen_layouts.output[0], task=FLOWN),
         scores=rules.aggregate.output.scores,
     output:
-        table=expand(f"{RESULTS}/tables/unseen_layouts.{{end}}", end=["csv", "tex"]),
-        markdown=report(
-            f"{RESULTS}/tables/unseen_layouts.md",
-            caption="../report/unseen_layouts.rst",
-            category="Tables",
+        *[
+            report(
+                f"{RESULTS}/tables/{name}.md",
+                caption=f"../report/{name}.rst",
+                category="Tables",
+            )
+            for name in ("unseen_layouts", "unseen_differences")
+        ],
+        table=expand(
+            f"{RESULTS}/tables/{{name}}.{{end}}",
+            name=["unseen_layouts", "unseen_differences"],
+            end=["csv", "tex"],
         ),
     log:
         f"{LOGS}/unseen_table.log",

@@ -27,7 +27,7 @@ with reported_errors():
         rows.append(row)
         examples[f"{certificate.name} on {task}"] = example
     # The map is that of the last one.
-    pictured.sort(key=lambda certificate: certificate.name.startswith(reference.METHOD))
+    pictured.sort(key=lambda certificate: certificate.name.partition(" (")[0] == reference.METHOD)
     mapped = certify.measured_margins(measurements, pictured[-1], certify.DEFAULT_TASK)
     figure = certify.picture(pictured, *mapped)
 table = certify.certificate_table(rows)

@@ -1,4 +1,4 @@
-"""Table I, the full results, what they cost, and the parts of the Push returns."""
+"""Table I, the full results, all pairs, what they cost, and the parts of the Push returns."""
 
 from pathlib import Path
 
@@ -15,8 +15,11 @@ runs = pd.read_csv(given.runs)
 missing = statistics.missing_runs(expected, runs)
 rule = tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
 made = [
-    tables.table_one(learned, missing=missing, rule=rule, tasks=params.tasks),
+    tables.table_one(
+        learned, missing=missing, rule=rule, tasks=params.tasks, baselines=params.baselines
+    ),
     tables.full_results(scores, missing=missing, rule=rule),
+    tables.differences(learned),
     tables.compute(runs),
 ]
 if params.push:

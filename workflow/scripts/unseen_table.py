@@ -4,14 +4,16 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import unseen
-from safemr.tables import SafetyRule
+from safemr import tables, unseen
 
 params = snakemake.params
+flown = pd.concat([pd.read_csv(path) for path in snakemake.input.flown], ignore_index=True)
 table = unseen.table(
-    pd.concat([pd.read_csv(path) for path in snakemake.input.flown], ignore_index=True),
+    flown,
     pd.read_csv(snakemake.input.scores),
     episodes=params.episodes,
-    rule=SafetyRule(params.tolerance, params.clean_share),
+    rule=tables.SafetyRule(params.tolerance, params.clean_share),
 )
-table.write(Path(snakemake.output.markdown).parent)
+source = f"{params.episodes} unseen layouts"
+for made in (table, tables.differences(flown, name="unseen_differences", source=source)):
+    made.write(Path(snakemake.output.table[0]).parent)
