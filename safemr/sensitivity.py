@@ -66,9 +66,10 @@ def weight_map(
     """
     rule = rule or SafetyRule()
     base = statistics.scores_of(scores, task, baseline, "eval_return")
-    rows = []
+    rows, runs = [], []
     for variant, (a, b) in sorted(points.items(), key=lambda item: item[1]):
         returns = statistics.scores_of(scores, task, variant, "eval_return")
+        runs += [(a, b, value) for value in returns]
         mean, gap = statistics.mean_interval(returns), statistics.difference_interval(returns, base)
         measured = [statistics.scores_of(scores, task, variant, m) for m in (rule.cost, rule.clean)]
         zeta = [statistics.scores_of(learned, task, variant, name) for name in ("sigma", "k", "n")]
@@ -100,7 +101,20 @@ def weight_map(
         "last sigma, k, n, means over seeds. The intervals are not corrected for the number of "
         "points."
     )
-    return Table("weight_map", caption, data, display, missing_notes(missing, [task], list(points)))
+    notes = [*_trend(np.array(runs).reshape(-1, 3)), *missing_notes(missing, [task], list(points))]
+    return Table("weight_map", caption, data, display, notes)
+
+
+def _trend(runs: np.ndarray) -> list[str]:
+    """What a and b do to the return over all points; runs [n, 3]: a, b, return."""
+    a, b = statistics.linear_effects(runs[:, :2] / 0.1, runs[:, 2])
+    if np.isnan(a.mean):
+        return []
+    shown = [f"{slope.mean:+.2f} ± {slope.half_width:.2f}" for slope in (a, b)]
+    return [
+        f"Least squares over the {len(runs)} runs: 0.1 more of a changes the return by {shown[0]}, "
+        f"0.1 more of b by {shown[1]} (95% t intervals, runs treated as independent)."
+    ]
 
 
 def _by_seed(scores: pd.DataFrame, task: str, variant: str, metric: str) -> pd.Series:

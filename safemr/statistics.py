@@ -101,6 +101,27 @@ def improvement_interval(ours: np.ndarray, baseline: np.ndarray, level: float = 
     return Estimate(ratio - 1, float(low) - 1, float(high) - 1, count)
 
 
+def linear_effects(factors: np.ndarray, values: np.ndarray, level: float = LEVEL) -> list[Estimate]:
+    """Slopes of values [n] against factors [n, k] by least squares with a constant, t intervals.
+
+    Runs are treated as independent. Too few of them, or factors that are not independent of each
+    other and of the constant, give nan.
+    """
+    count, slopes = factors.shape
+    design = np.column_stack([np.ones(count), factors])
+    free = count - slopes - 1
+    if free < 1 or np.linalg.matrix_rank(design) <= slopes:
+        return [Estimate(np.nan, np.nan, np.nan, count)] * slopes
+    inverse = np.linalg.inv(design.T @ design)
+    found = inverse @ design.T @ values
+    variance = float(((values - design @ found) ** 2).sum()) / free
+    half = stdtrit(free, (1 + level) / 2) * np.sqrt(variance * np.diag(inverse))
+    return [
+        Estimate(float(mean), float(mean - reach), float(mean + reach), count)
+        for mean, reach in zip(found[1:], half[1:], strict=True)
+    ]
+
+
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
     """Mean of the middle half along the last axis: floor(n/4) values dropped at each end."""
     ordered = np.sort(np.asarray(values, dtype=float), axis=-1)

@@ -238,3 +238,21 @@ def test_violations_of_training_are_summed_over_episodes():
     assert total == {
         "task": "t", "variant": "v", "seed": 0, "metric": "train_violations", "value": 10.0
     }  # fmt: skip
+
+
+def test_linear_effects_are_those_of_simple_regression_where_factors_are_orthogonal():
+    generator = np.random.default_rng(0)
+    x = np.repeat([0.0, 1.0, 2.0, 3.0], 5)
+    y = 2 * x + generator.normal(size=x.size)
+    (slope,) = statistics.linear_effects(x[:, None], y)
+    expected = stats.linregress(x, y)
+    assert slope.mean == pytest.approx(expected.slope)
+    half = stats.t.ppf(0.975, x.size - 2) * expected.stderr
+    assert slope.half_width == pytest.approx(half)
+
+
+@pytest.mark.parametrize("factors", [np.ones((5, 1)), np.arange(2.0)[:, None], np.zeros((0, 2))])
+def test_linear_effects_need_factors_that_vary_and_runs(factors):
+    found = statistics.linear_effects(factors, np.zeros(len(factors)))
+    assert len(found) == factors.shape[1]
+    assert all(np.isnan(effect.mean) for effect in found)

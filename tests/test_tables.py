@@ -177,6 +177,16 @@ def test_weight_map_measures_each_point_against_the_method_without_weights(score
     assert (row["gain_low"], row["gain_high"]) == (gap.low, gap.high)
 
 
+def test_weight_map_tells_what_the_weights_do_over_all_points():
+    points = {f"SafeMR[{a},{b}]": (a, b) for a in (0.1, 0.2, 0.4) for b in (0.1, 0.3)}
+    rows = [(TASK, name, seed, "eval_return", 3 + 20 * a - 5 * b + 0.1 * (-1) ** seed)
+            for name, (a, b) in points.items() for seed in (0, 1)]  # fmt: skip
+    given = pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+    (note,) = sensitivity.weight_map(given, given.iloc[:0], points).notes
+    assert "over the 12 runs: 0.1 more of a changes the return by +2.00 ±" in note
+    assert "0.1 more of b by -0.50 ±" in note
+
+
 def test_push_returns_are_split_into_their_parts():
     rows = [(OTHER, name, seed, metric, value)
             for name, parts in (("SafeMR", (1.5, 0.2)), ("scripted: pushes the box", (1.5, 2.4)))
