@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from safemr import reference, statistics
+from safemr.convergence import certificate_settles_last, losses_bounded
 from safemr.evidence import (
     NOTHING,
     Evidence,
@@ -28,7 +29,6 @@ from safemr.evidence import (
     describe,
     on_every_task,
     overall,
-    smooth_curves,
     surely_below,
     unavailable,
 )
@@ -37,7 +37,6 @@ from safemr.tables import Table, best_safe_baseline
 
 COLUMNS = ["estimate", "low", "high", "count"]
 COVERS = 0.01  # a certificate covers the true unsafe set if it misses at most this share of it
-GROWTH = 2.0  # "bounded": the last quarter at most this many times the largest before
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def zero_violations(evidence: Evidence) -> Finding:
         shown = f"clean share {describe(estimate)}"
         if (shares == 1).all():
             return Finding(estimate, "confirmed", f"{shown}, no violation observed")
-        seeds = f"violations in {(shares < 1).sum()} of {len(shares)} seeds"
+        seeds = f"violations in {(shares != 1).sum()} of {len(shares)} seeds"
         return Finding(estimate, "refuted", f"{shown}, {seeds}")
 
     return on_every_task(evidence, [reference.METHOD], judge)
@@ -225,11 +224,14 @@ def point_costs_vanish(evidence: Evidence) -> Finding:
     )  # fmt: skip
 
 
-# --- feasibility and convergence -----------------------------------------------------------------
+# --- feasibility -----------------------------------------------------------------------------
 
 
-def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
-    """No searched state lacks a safe action, for every certificate whose name starts with `prefix`.
+def parameters_feasible(group: str, evidence: Evidence) -> Finding:
+    """No searched state lacks a safe action, for every certificate of a group.
+
+    The group is the paper's ("paper") or a variant's at every point [a, b].
+
 
     Feasible means that the safe action set is nonempty at every state, so one replayable state
     without a safe action refutes it; a search that finds none leaves it unrefuted, and then the
@@ -240,9 +242,9 @@ def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
     """
     rows = evidence.certificates
     if rows is not None:
-        rows = rows[rows["certificate"].str.startswith(prefix)]
+        rows = rows[[_belongs(name, group) for name in rows["certificate"]]]
     if rows is None or rows.empty:
-        return unavailable(f"certify results of {prefix} ...")
+        return unavailable(f"certify results of {group}")
     worst = rows.sort_values("worst_margin").iloc[-1]
     share = float(rows["infeasible_share"].max())
     estimate = Estimate(float(worst["worst_margin"]), np.nan, np.nan, len(rows))
@@ -261,63 +263,6 @@ def parameters_feasible(prefix: str, evidence: Evidence) -> Finding:
         return Finding(estimate, "refuted", f"{found}; {shown}")
     verdict: Verdict = "confirmed" if (aligned >= 0).all() else "inconclusive"
     return Finding(estimate, verdict, f"{shown}; no infeasible state found")
-
-
-def certificate_settles_last(evidence: Evidence) -> Finding:
-    """Share of training at which zeta settles, minus that of return and mean multiplier.
-
-    A curve has settled where it stays within a tenth of its range of its final value, after a
-    trailing average over a tenth of its points. One number a SafeMR run: the last of sigma, k, n
-    minus the last of the other two. Interval above 0 on every task.
-    """
-    late = ("sigma", "k", "n")
-    metrics = (*late, "train_return", "multiplier_mean")
-
-    def judge(task: str) -> Finding:
-        lags = []
-        for curves in smooth_curves(evidence.progress, task, metrics):
-            settled = {
-                metric: statistics.settling_share(steps, values)
-                for metric, (steps, values) in curves.items()
-            }
-            others = [settled[metric] for metric in settled if metric not in late]
-            own = [settled[metric] for metric in late if metric in settled]
-            if own and others:
-                lags.append(max(own) - max(others))
-        if not lags:
-            return unavailable(f"curves of SafeMR on {task}")
-        return by_interval(statistics.mean_interval(np.array(lags)), 0.0, "settling lag")
-
-    return on_every_task(evidence, [reference.METHOD], judge)
-
-
-def losses_bounded(evidence: Evidence) -> Finding:
-    """Largest |value| in the last quarter over that in the rest, every loss and gradient norm.
-
-    One number a SafeMR run, its worst metric, after the same trailing average. Confirmed if the
-    interval ends at or below 2 on every task; refuted if it begins above, or if any value is not
-    finite. A run that diverged leaves no record and counts as missing.
-    """
-    names = evidence.progress.loc[evidence.progress["variant"] == reference.METHOD, "metric"]
-    metrics = [m for m in names.unique() if m.endswith(("_loss", "_grad_norm"))]
-
-    def judge(task: str) -> Finding:
-        runs = smooth_curves(evidence.progress, task, metrics)
-        if not runs:
-            return unavailable(f"losses and gradient norms of SafeMR on {task}")
-        ratios = []
-        for curves in runs:
-            worst = 0.0
-            for steps, values in curves.values():
-                if not np.isfinite(values).all():
-                    return Finding(NOTHING, "refuted", "a loss or gradient norm is not finite")
-                late = steps > 0.75 * steps[-1]
-                early = np.abs(values[~late]).max(initial=0.0)
-                worst = max(worst, float(np.abs(values[late]).max() / max(early, 1e-12)))
-            ratios.append(worst)
-        return at_most(statistics.mean_interval(np.array(ratios)), GROWTH, "growth")
-
-    return on_every_task(evidence, [reference.METHOD], judge)
 
 
 # --- the list ------------------------------------------------------------------------------------
@@ -450,6 +395,12 @@ def claims_table(evidence: Evidence) -> Table:
         f"{str(evidence.rule).capitalize()}."
     )
     return Table("claims", caption, data, display)
+
+
+def _belongs(certificate: str, group: str) -> bool:
+    """Whether a certificate's name, "label (seed n)", is of a group: SafeMR, not SafeMR-literal."""
+    label = certificate.partition(" (")[0]
+    return label == group or label.startswith((f"{group} [", f"{group}["))
 
 
 def _missing_points(evidence: Evidence, variants: Sequence[str]) -> str:

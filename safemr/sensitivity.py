@@ -107,6 +107,7 @@ def weight_map(
 
 def _trend(runs: np.ndarray) -> list[str]:
     """What a and b do to the return over all points; runs [n, 3]: a, b, return."""
+    runs = runs[np.isfinite(runs[:, 2])]
     a, b = statistics.linear_effects(runs[:, :2] / 0.1, runs[:, 2])
     if np.isnan(a.mean):
         return []

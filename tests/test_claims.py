@@ -47,6 +47,20 @@ def test_highest_return_follows_the_interval_of_the_difference(scores, shift, ex
     assert verdict(f"highest_return[{TASK}]", evidence(scores)) == expected
 
 
+def test_the_methods_certificates_are_its_own_and_those_of_its_points():
+    row = {"infeasible_share": 0.0, "margin_inside_aligned": 1.0, "margin_outside_aligned": 1.0,
+           "margin_inside_drag": -1.0, "margin_outside_drag": -1.0}  # fmt: skip
+    names = {"SafeMR (seed 0)": -0.1, "SafeMR[0.45,0.15] (seed 0)": -0.2,
+             "SafeMR-literal (seed 0)": 0.3, "paper [0.35, 0.15]": 0.4}  # fmt: skip
+    rows = [{"certificate": name, "worst_margin": worst, **row} for name, worst in names.items()]
+    finding = claims.parameters_feasible(
+        "SafeMR", evidence(score_rows(), certificates=pd.DataFrame(rows))
+    )
+    assert finding.verdict == "confirmed"
+    assert finding.estimate.mean == -0.1
+    assert finding.reason.startswith("2 certificates")
+
+
 def test_an_unsafe_method_cannot_have_the_highest_safe_return(scores):
     scores = with_baselines(scores)
     ours = (scores["variant"] == "SafeMR") & (scores["metric"] == "eval_cost_indicator")

@@ -8,7 +8,7 @@ import pytest
 from sample_scores import OTHER, RETURNS, TASK, expected_runs, score_rows
 from scipy import stats
 
-from safemr import reference, sensitivity, statistics, tables
+from safemr import comparisons, reference, sensitivity, statistics, tables
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_a_baseline_that_is_added_counts_in_table_one(scores):
 
 
 def test_differences_compare_every_two_algorithms_of_a_task_once(scores):
-    table = tables.differences(scores)
+    table = comparisons.differences(scores)
     pairs = table.data.set_index(["task", "variant", "other"])
     assert len(pairs) == 5 * 4 // 2 + 1
     gap = pairs.loc[(TASK, "JointSIS", "SafeMR")]
@@ -137,6 +137,7 @@ def test_no_run_at_all_still_makes_every_table(scores):
         tables.table_one(nothing, missing=missing),
         tables.full_results(nothing, missing=missing),
         tables.push_split(nothing, missing=missing),
+        comparisons.differences(nothing, missing=missing),
         sensitivity.table_two(nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
         sensitivity.weight_map(nothing, nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
     ):

@@ -25,14 +25,14 @@ def draw_return_against_cost(
 ) -> Axes:
     """One small marker a seed, the mean over seeds large, and hollow if `unsafe`.
 
-    points: variant, seed, cost, return. Costs of 0 are spread around 0, the variants that have
+    points: variant, seed, cost, return. Costs of 0 are spread left of 0, the variants that have
     any side by side, or most would lie upon each other.
     """
     if tolerance is not None:
         ax.axvspan(-1, tolerance, color="#009E73", alpha=0.08, lw=0, zorder=0)
     variants = style.ordered(points["variant"].unique())
-    clean = style.ordered(points.loc[points["cost"] < 0.05, "variant"].unique())
-    sides = {variant: 0.5 * ((i + 0.5) / len(clean) - 0.5) for i, variant in enumerate(clean)}
+    clean = style.ordered(points.loc[points["cost"] == 0, "variant"].unique())
+    sides = {variant: 0.5 * ((i + 0.5) / len(clean) - 1) for i, variant in enumerate(clean)}
     for order, variant in enumerate(reversed(variants)):  # the first of the legend on top
         run = points[points["variant"] == variant]
         tint = style.colour(variant)
@@ -40,14 +40,14 @@ def draw_return_against_cost(
         side = sides.get(variant, 0.0)
         middle = run["cost"].mean()
         fill = {"mfc": "none", "mec": tint, "mew": 1.1} if variant in unsafe else {"mec": "white"}
-        ax.plot(middle + side * (middle < 0.05), run["return"].mean(), ms=6, zorder=2 + order / 100,
+        ax.plot(middle + side * (middle == 0), run["return"].mean(), ms=6, zorder=2 + order / 100,
                 **{"mew": 0.6, **look, **fill})  # fmt: skip
-        shifted = run["cost"] + side * (run["cost"] < 0.05)
+        shifted = run["cost"] + side * (run["cost"] == 0)
         ax.plot(shifted, run["return"], ms=2.6, alpha=0.75, zorder=3 + order / 100,
                 **{"mec": "white", "mew": 0.25, **look})  # fmt: skip
     ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
     right = max(1.6 * points["cost"].max(), 10.0) if len(points) else 10.0
-    ax.set_xlim(-0.32, right)
+    ax.set_xlim(-0.55, right)
     ax.set_xticks([tick for tick in (0, 1, 10, 100, 1000) if tick <= right])
     ax.set_xticks([], minor=True)
     ax.xaxis.set_major_formatter("{x:g}")

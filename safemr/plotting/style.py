@@ -60,12 +60,12 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
     "FAC-phih": ("#E69F00", _DOTTED, "X", r"FAC-$\phi_h$"),
     "SAC-L": ("#000000", _DASHED, "*", "SAC-L"),
     # config/variants.yaml
-    "SafeMR-literal": ("#882255", _DASH_DOTTED, ">", "SafeMR-literal"),
-    "SafeMR-floor-0.02": ("#999933", _DASH_DOTTED, "h", "SafeMR-floor-0.02"),
-    "SafeMR-floor-0": ("#CC6677", _DASH_DOTTED, "p", "SafeMR-floor-0"),
-    "SafeMR-replay": ("#117733", _DASH_DOTTED, "*", "SafeMR-replay"),
-    "JointSIS-literal": ("#332288", _DASH_DOTTED, "<", "JointSIS-literal"),
-    "JointSIS-released": ("#88CCEE", _DASH_DOTTED, "d", "JointSIS-released"),
+    "SafeMR-literal": ("#AA3377", _DASH_DOTTED, ">", "SafeMR-literal"),
+    "SafeMR-floor-0.02": ("#CCBB44", _DASH_DOTTED, "h", "SafeMR-floor-0.02"),
+    "SafeMR-floor-0": ("#EE6677", _DASH_DOTTED, "p", "SafeMR-floor-0"),
+    "SafeMR-replay": ("#228833", _DASH_DOTTED, "8", "SafeMR-replay"),
+    "JointSIS-literal": ("#1B1464", _DASH_DOTTED, "<", "JointSIS-literal"),
+    "JointSIS-released": ("#66CCEE", _DASH_DOTTED, "d", "JointSIS-released"),
 }
 # Tol's "muted" colours for variants that nobody planned.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")

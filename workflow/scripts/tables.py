@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import statistics, tables
+from safemr import comparisons, statistics, tables
 
 given, params = snakemake.input, snakemake.params
 learned = pd.read_csv(given.scores)
@@ -19,7 +19,7 @@ made = [
         learned, missing=missing, rule=rule, tasks=params.tasks, baselines=params.baselines
     ),
     tables.full_results(scores, missing=missing, rule=rule),
-    tables.differences(learned),
+    comparisons.differences(learned, missing=missing),
     tables.compute(runs),
 ]
 if params.push:

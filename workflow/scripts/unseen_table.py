@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import tables, unseen
+from safemr import comparisons, tables, unseen
 
 params = snakemake.params
 flown = pd.concat([pd.read_csv(path) for path in snakemake.input.flown], ignore_index=True)
@@ -15,5 +15,5 @@ table = unseen.table(
     rule=tables.SafetyRule(params.tolerance, params.clean_share),
 )
 source = f"{params.episodes} unseen layouts"
-for made in (table, tables.differences(flown, name="unseen_differences", source=source)):
+for made in (table, comparisons.differences(flown, name="unseen_differences", source=source)):
     made.write(Path(snakemake.output.table[0]).parent)
