@@ -305,17 +305,14 @@ def claims(tasks: Sequence[str] = reference.TASKS) -> list[Claim]:
     )  # fmt: skip
     listed += [
         Claim(
-            f"unsafe[{variant}]", f"{variant} is not safe at cost limit zero",
-            "violating steps an episode, the task that decides", "return_against_cost",
-            partial(unsafe_everywhere, variant),
+            f"{name}[{variant}]", f"{variant} {says}", measure, "return_against_cost",
+            partial(judge, variant),
         )
-        for variant in (*reference.CMDP_BASELINES, "FAC-phi0")
-    ]  # fmt: skip
-    listed += [
-        Claim(
-            f"higher_return[{variant}]", f"{variant} has a higher return than SafeMR",
-            "difference of final returns, the task that decides", "return_against_cost",
-            partial(higher_than_ours, variant),
+        for name, says, measure, judge in (
+            ("unsafe", "is not safe at cost limit zero",
+             "violating steps an episode, the task that decides", unsafe_everywhere),
+            ("higher_return", "has a higher return than SafeMR",
+             "difference of final returns, the task that decides", higher_than_ours),
         )
         for variant in (*reference.CMDP_BASELINES, "FAC-phi0")
     ]  # fmt: skip
