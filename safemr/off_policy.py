@@ -57,7 +57,7 @@ class Trainer:
         self._held = torch.zeros(config.num_envs, action_dim)
         self._episodes = EpisodeStatistics(config.num_envs)
         self._owed = 0.0  # gradient steps earned by experience, not yet done
-        observations, infos = self.envs.reset(seed=environment_seed(seed))
+        observations, infos = self.envs.reset(seed=environment_seed(seed, 4))
         self._observations: NDArray[np.float32] = self.transform(observations)
         self._features = self._energy_features(infos)
 

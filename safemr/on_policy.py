@@ -23,7 +23,7 @@ from safemr.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.observation import ObservationTransform
 from safemr.policies import Policy
 from safemr.rollout import Rollout, gae, minibatches
-from safemr.training import MakeEnvs, check_finite, generator
+from safemr.training import MakeEnvs, check_finite, environment_seed, generator
 
 # Settings of the published experiments (safety-starter-agents) that differ from the defaults here;
 # the algorithms add their own. Networks and epoch are those of the JointSIS authors' comparison.
@@ -165,9 +165,7 @@ class OnPolicyTrainer(ABC):
             config.epoch_steps // config.num_envs, config.num_envs, inputs, actions
         )
         self.statistics = EpisodeStatistics(config.num_envs)
-        # sub-environment i is seeded with this + i: streams of neighbouring run seeds must not meet
-        (env_seed,) = np.random.SeedSequence([seed, 3]).generate_state(1)
-        self.observations, _ = self.envs.reset(seed=int(env_seed >> 1))
+        self.observations, _ = self.envs.reset(seed=environment_seed(seed, 3))
 
     @property
     def policy(self) -> Policy:

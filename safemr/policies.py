@@ -68,7 +68,14 @@ class Policy:
         deterministic: bool = True,
         generator: torch.Generator | None = None,
     ) -> NDArray[np.float32]:
-        """Actions float32 [N, A] for raw environment observations [N, obs]."""
+        """Actions float32 [N, A] for raw environment observations [N, obs], or [A] for one [obs].
+
+        Raises UserError where the observations are not of the environment that this policy reads.
+        """
+        observations = np.asarray(observations)
+        self.transform.check_width(observations)
+        if observations.ndim == 1:
+            return self.act(observations[None], deterministic, generator)[0]
         parameters = self.network.parameters
         inputs = torch.from_numpy(self.transform(observations)).to(parameters.device)
         output = self.network(inputs)[0]

@@ -67,11 +67,11 @@ def generator(seed: int, stream: int, device: str = "cpu") -> torch.Generator:
     return torch.Generator(device).manual_seed(int(word >> np.uint64(1)))
 
 
-def environment_seed(seed: int) -> int:
-    """Seed of a run's first sub-environment.
+def environment_seed(seed: int, stream: int) -> int:
+    """Seed of a run's first sub-environment; ``stream`` is that of a purpose, as in `generator`.
 
     Sub-environment i gets this plus i, so the seeds of neighbouring runs (0, 1, 2, ...) themselves
     would give them almost the same layouts.
     """
-    (word,) = np.random.SeedSequence([seed, 4]).generate_state(1)
+    (word,) = np.random.SeedSequence([seed, stream]).generate_state(1)
     return int(word >> 1)
