@@ -406,8 +406,8 @@ def learners(
         found.append((run, saved))
     if lacking:
         raise UserError(
-            f"no {records.POLICY} with {' and '.join(needed)} in {', '.join(lacking)}: remove "
-            "these records to train them again, or take them out of aircraft.algorithms"
+            f"no {records.POLICY} with {' and '.join(needed)} in {', '.join(lacking)} under "
+            f"{root}: take them out of aircraft.algorithms, or train them again"
         )
     return found
 

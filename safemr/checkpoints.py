@@ -257,7 +257,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
 
     def _remove_temporary_files(self) -> None:
         for folder in (self.work, self.folder):
-            for leftover in folder.glob("*.tmp"):
+            for leftover in folder.glob(".*.tmp"):
                 leftover.unlink(missing_ok=True)
 
     @contextlib.contextmanager

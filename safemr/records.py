@@ -18,7 +18,9 @@ import hashlib
 import io
 import json
 import math
+import os
 import re
+import shlex
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,6 +46,11 @@ REQUIRED_FILES = (CONFIG, PROGRESS, PROVENANCE)
 REQUIRED_METRICS = ("eval_return", "eval_cost", "eval_zero_violation_share")
 CONFIG_KEYS = {"schema", "task", "algorithm", "seed", "steps", "evaluation", "log_every"}
 PROVENANCE_KEYS = {"schema", "digest", "variant", "status", "files"}
+
+# Where a record stands, <results root>/runs/<task>/<variant>/seed<n>-<digest>, and whose files it
+# may hold. Nothing else is ever advised to be removed.
+_PLACE = re.compile(r"(^|.*/)runs/[^/]+/[^/]+/seed\d+-[0-9a-f]{12}")
+_OWN = re.compile(r"config\.json|progress\.csv|policy\.npz|provenance\.json|\..+\.tmp")
 
 Row = Mapping[str, float]
 
@@ -184,8 +191,10 @@ def is_complete(folder: Path) -> bool:
 def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, float]]]:
     """The config, provenance and progress rows of a record that passed every check."""
 
+    _require_place(folder)
+
     def refuse(fault: str) -> RecordError:
-        return RecordError(f"record {folder}: {fault}; repair: rm -r '{folder}' && snakemake -j2")
+        return RecordError(f"record {folder}: {fault}; repair: {_repair(folder)}")
 
     missing = [name for name in REQUIRED_FILES if not (folder / name).is_file()]
     if missing:
@@ -216,8 +225,8 @@ def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[s
         raise refuse(f"config.json is malformed ({error!r})") from None
     if config_digest(config) != provenance["digest"]:
         raise refuse("config.json does not have the digest in provenance.json")
-    if folder.absolute().parts[-len(place) :] != place:
-        raise refuse(f"it belongs to {Path(*place)}")
+    if _full(folder).parts[-len(place) :] != place:
+        raise refuse(f"it belongs to {Path(*place)}: move it there, or")
     try:
         rows = parse_progress(contents[PROGRESS].decode())
     except ValueError as error:
@@ -229,6 +238,41 @@ def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[s
     if rows[-1]["step"] < config["steps"]:
         raise refuse(f"progress.csv ends at step {rows[-1]['step']} of {config['steps']}")
     return config, provenance, rows
+
+
+def _full(folder: Path) -> Path:
+    """An absolute path without ``..``, symbolic links kept: what a person would call the place."""
+    return Path(os.path.abspath(folder))
+
+
+def _require_place(folder: Path) -> None:
+    """Raises RecordError where ``folder`` is not a record's place and hence none of ours."""
+    if _PLACE.fullmatch(_full(folder).as_posix()) and (folder.is_dir() or not folder.exists()):
+        return
+    what = "a record is a folder <results root>/runs/<task>/<variant>/seed<n>-<digest>"
+    if not folder.is_dir():
+        kind = "a file" if folder.exists() else "no folder"
+        raise RecordError(f"record {folder}: it is {kind}; {what}")
+    entries = sorted(path.name for path in folder.iterdir())
+    found = f"it holds {_some(entries)}" if entries else "it is empty"
+    raise RecordError(f"record {folder}: {found}; {what} with {', '.join(REQUIRED_FILES)}")
+
+
+def _repair(folder: Path) -> str:
+    """The command that makes a record anew; removing what is not a record's is never advised."""
+    if not folder.exists():
+        return "snakemake -j2, which trains it where the configuration asks for it"
+    foreign = sorted(path.name for path in folder.iterdir() if not _OWN.fullmatch(path.name))
+    if foreign:
+        return f"it also holds {_some(foreign)}, which is no part of a record; move that away first"
+    quoted = shlex.quote(str(folder))
+    return f"rm -r {quoted} && snakemake -j2"
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    more = len(names) - 5
+    return ", ".join(names[:5]) + (f" and {more} more" if more > 0 else "")
 
 
 def read_records(
