@@ -46,6 +46,7 @@ REQUIRED_FILES = (CONFIG, PROGRESS, PROVENANCE)
 REQUIRED_METRICS = ("eval_return", "eval_cost", "eval_zero_violation_share")
 CONFIG_KEYS = {"schema", "task", "algorithm", "seed", "steps", "evaluation", "log_every"}
 PROVENANCE_KEYS = {"schema", "digest", "variant", "status", "files"}
+MEASURED = ("wall_s", "cpu_s", "peak_rss_mb")  # optional numbers of provenance.json
 
 # Where a record stands, <results root>/runs/<task>/<variant>/seed<n>-<digest>, and whose files it
 # may hold. Nothing else is ever advised to be removed.
@@ -219,6 +220,13 @@ def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[s
     for name in (CONFIG, PROGRESS, *([POLICY] if POLICY in contents else [])):
         if hashlib.sha256(contents[name]).hexdigest() != provenance["files"].get(name):
             raise refuse(f"{name} does not have the checksum in provenance.json")
+    for name in MEASURED:
+        value = provenance.get(name)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if value is not None and not (number and 0 <= value < math.inf):
+            raise refuse(f"{name} in its provenance is not a number of at least 0")
+    if not isinstance(provenance.get("cpu"), (str, type(None))):
+        raise refuse("cpu in its provenance is not text")
     try:
         place = record_path(config, provenance["variant"]).parts
     except (KeyError, TypeError, ValueError) as error:
@@ -286,8 +294,8 @@ def read_records(
 
     Returns:
         The index (task, variant, seed, digest, folder, algorithm, steps, and what provenance says
-        of time and machine), one row a run; and the tidy progress table (task, variant, seed,
-        step, metric, value) without NaN values.
+        of time and machine, nan or None where it says nothing), one row a run; and the tidy
+        progress table (task, variant, seed, step, metric, value) without NaN values.
 
     Raises:
         RecordError: on the first record that must not be believed.
@@ -313,9 +321,7 @@ def read_records(
                 "digest": provenance["digest"],
                 "algorithm": config["algorithm"]["name"],
                 "steps": config["steps"],
-                **{
-                    name: provenance.get(name) for name in ("wall_s", "cpu_s", "peak_rss_mb", "cpu")
-                },
+                **{name: provenance.get(name) for name in (*MEASURED, "cpu")},
                 "folder": folder.as_posix(),
             }
         )
@@ -324,4 +330,6 @@ def read_records(
         tables.append(tidy.assign(**key))
     columns = ["task", "variant", "seed", "step", "metric", "value"]
     progress = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=columns)
-    return pd.DataFrame(index), progress[columns]
+    runs = pd.DataFrame(index)
+    # A column that no record fills would hold None, with which nothing can be computed.
+    return runs.astype({name: float for name in MEASURED if name in runs}), progress[columns]

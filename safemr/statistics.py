@@ -360,11 +360,12 @@ def core_minutes(progress: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
     The log holds wall time; a run's processor time is spread over it evenly, so that a busy machine
     does not make an algorithm look slow. runs: the runs table with wall_s and cpu_s. Returns task,
-    variant, step, minutes.
+    variant, step, minutes; runs whose records do not say both times, or log none, have no part.
     """
     keys = ["task", "variant", "seed"]
+    timed = runs[(runs["cpu_s"] > 0) & (runs["wall_s"] > 0)]
     clock = progress[progress["metric"] == "time_wall_s"].merge(
-        runs.assign(busy=runs["cpu_s"] / runs["wall_s"])[[*keys, "busy"]], on=keys
+        timed.assign(busy=timed["cpu_s"] / timed["wall_s"])[[*keys, "busy"]], on=keys
     )
     clock["minutes"] = clock["value"] * clock["busy"] / 60
     return clock.groupby(["task", "variant", "step"], sort=False)["minutes"].mean().reset_index()
