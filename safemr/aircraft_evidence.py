@@ -32,7 +32,7 @@ from safemr.plotting.aircraft import Slice
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
 from safemr.runs import describe_task
-from safemr.tables import ABSENT, Table, describe_missing
+from safemr.tables import ABSENT, FEW, Table, describe_missing, plus_minus
 
 if TYPE_CHECKING:
     from safemr.policies import Policy
@@ -325,7 +325,8 @@ def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = No
         "constraint, with eta 0 and the learner's; states of the claimed safe set that every turn "
         f"leaves. Deterministic policies from {FLIGHTS:,} truly safe states: flights that collide, "
         "mean sum of a^2. The policy of a fixed certificate keeps its constraint with the least "
-        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval."
+        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval, "
+        f"or [its ends] where it is cut off at a bound of the quantity. {FEW}"
     )
     trained = (comparison["kind"] == "learner").any()
     notes = [_verdict(as_scores(comparison))] if trained else []
@@ -356,12 +357,12 @@ def _verdict(scores: pd.DataFrame, method: str = "SafeMR", rival: str = "JointSI
 
 
 def _cell(values: pd.Series, factor: float, digits: int) -> str:
-    estimate = statistics.mean_interval(factor * values.to_numpy(float))
-    if np.isnan(estimate.mean):
-        return ABSENT
-    if np.isnan(estimate.half_width):
-        return f"{estimate.mean:.{digits}f}"
-    return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
+    """Shares are multiplied by 100; nothing here is negative, and no share above its whole."""
+    share = factor == 100 or values.name == "iou"
+    estimate = statistics.mean_interval(
+        factor * values.to_numpy(float), bounds=(0.0, factor if share else np.inf)
+    )
+    return ABSENT if np.isnan(estimate.mean) else plus_minus(*estimate[:3], digits)
 
 
 @dataclass(frozen=True)

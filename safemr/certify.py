@@ -27,8 +27,9 @@ from safemr.feasibility import BRAKINGS, CONVENTIONS, analytic_condition
 from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.records import CONFIG, POLICY, PROGRESS, PROVENANCE, parse_progress, verify_record
 from safemr.reference import Zeta
-from safemr.runs import describe_task
+from safemr.runs import installed
 from safemr.tables import Table
+from safemr.tasks import Task, name_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,8 +60,8 @@ def paper_certificates() -> list[Certificate]:
     ]
 
 
-def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any]]:
-    """The certificate a run ended with, its task, and the task's settings.
+def certificate_of_record(folder: Path) -> tuple[Certificate, dict[str, Any]]:
+    """The certificate a run ended with, and its task: the entry in the run's config.
 
     The last logged sigma, k and n; `policy` is None where the record has none (it is optional).
     Raises UserError where there is no record, or none of the energy-function family.
@@ -77,17 +78,16 @@ def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any
     variant = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["variant"]
     name = f"{variant} (seed {config['seed']})"
     policy = folder if (folder / POLICY).exists() else None
-    return Certificate(name, zeta, eta, policy), task["name"], dict(task.get("settings", {}))
+    return Certificate(name, zeta, eta, policy), dict(task)
 
 
 def certify(
     certificate: Certificate,
-    task: str = DEFAULT_TASK,
+    task: Task = DEFAULT_TASK,
     *,
     states: int = DEFAULT_STATES,
     seed: int = 0,
     episodes: int = 32,
-    settings: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], falsification.Falsification]:
     """One row of the certificate table, and the search behind it.
 
@@ -99,10 +99,10 @@ def certify(
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
     analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
-    search = falsification.falsify(envs, zeta, eta=eta, count=states, seed=seed)
+    search = falsification.falsify(envs, zeta, eta=eta, count=states, seed=seed, task=task)
     envs.close()
     row: dict[str, Any] = {
-        "certificate": certificate.name, "task": task, **zeta._asdict(), "eta": eta,
+        "certificate": certificate.name, "task": name_of(task), **zeta._asdict(), "eta": eta,
         **{_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()},
         "states": len(search.states), "infeasible_share": search.infeasible_share,
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
@@ -113,7 +113,7 @@ def certify(
 
         check = falsification.check_policy(
             load_policy(certificate.policy), task, zeta, eta=eta, num_envs=episodes, seed=seed,
-            limit=8 * episodes, settings=settings,
+            limit=8 * episodes,
         )  # fmt: skip
         row |= {
             "policy_steps": check.steps,
@@ -126,24 +126,21 @@ def certify(
 def measured_certificate(
     measurements: Measurements,
     certificate: Certificate,
-    task: str,
+    task: Task,
     *,
     states: int,
     episodes: int,
-    settings: Mapping[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of `certify` and the example of its search, kept among ``measurements``."""
     inputs = {
         "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
-        "task": describe_task(task, settings),
+        "task": installed(task),
         "states": states, "episodes": episodes,
         "policy": certificate.policy and record_inputs(certificate.policy),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
-        row, search = certify(
-            certificate, task, states=states, episodes=episodes, settings=settings
-        )
+        row, search = certify(certificate, task, states=states, episodes=episodes)
         return {"row": row, "example": search.example()}
 
     kept = measurements.rows("certificates", _label(certificate, task), inputs, measure)
@@ -151,12 +148,12 @@ def measured_certificate(
 
 
 def measured_margins(
-    measurements: Measurements, certificate: Certificate, task: str
+    measurements: Measurements, certificate: Certificate, task: Task
 ) -> tuple[pd.DataFrame, float]:
     """`margin_map` of a certificate, and the task's d_min, kept among ``measurements``."""
     inputs = {
         "zeta": list(certificate.zeta), "eta": certificate.eta,
-        "task": describe_task(task, {}),
+        "task": installed(task),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
@@ -212,7 +209,7 @@ def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def margin_map(
-    task: str, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
+    task: Task, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
 ) -> pd.DataFrame:
     """Best margin of the least favourable motion at each distance and bearing.
 
@@ -255,11 +252,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _replay(options.replay)
     jobs = _jobs(options)
     rows, searches = [], []
-    for certificate, task, settings in jobs:
-        print(f"certifying {certificate.name} on {task} ...", file=sys.stderr)
-        row, search = certify(
-            certificate, task, states=options.states, seed=options.seed, settings=settings
-        )
+    for certificate, task in jobs:
+        print(f"certifying {certificate.name} on {name_of(task)} ...", file=sys.stderr)
+        row, search = certify(certificate, task, states=options.states, seed=options.seed)
         rows.append(row)
         searches.append(search)
     table = certificate_table(rows)
@@ -271,8 +266,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, str, dict[str, Any]]]:
-    """What the command line asks for: (certificate, task, settings) each."""
+def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, Task]]:
+    """What the command line asks for: (certificate, task) each."""
     given = (options.sigma, options.k, options.n)
     if options.record:
         if any(value is not None for value in given):
@@ -286,13 +281,13 @@ def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, str, dict[str,
         if min(options.sigma, options.k) < 0 or options.n <= 0:
             raise UserError("sigma and k must not be negative and n must be positive")
         named = [Certificate(options.name, Zeta(*given))]
-    return [(Certificate(c.name, c.zeta, options.eta), options.task, {}) for c in named]
+    return [(Certificate(c.name, c.zeta, options.eta), options.task) for c in named]
 
 
 def _write(
     folder: Path,
     table: Table,
-    jobs: Sequence[tuple[Certificate, str, Mapping[str, Any]]],
+    jobs: Sequence[tuple[Certificate, Task]],
     searches: Sequence[falsification.Falsification],
 ) -> None:
     from safemr.plotting import style
@@ -342,13 +337,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _label(certificate: Certificate, task: str) -> str:
+def _label(certificate: Certificate, task: Task) -> str:
     if certificate.policy is not None:
         return record_label(certificate.policy)
-    return f"{certificate.name} {task}"
+    return f"{certificate.name} {name_of(task)}"
 
 
-def _d_min(task: str) -> float:
+def _d_min(task: Task) -> float:
     envs = falsification.make_simulator(task, 1)
     d_min = float(envs.d_min)
     envs.close()

@@ -46,8 +46,19 @@ class Outside:
 
 
 @dataclass(frozen=True)
+class TaskVariant:
+    """A task with a name of its own: a registered one with other settings."""
+
+    base: str
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class TaskOverrides:
-    """What differs on one task, for all algorithms of a family alike."""
+    """What differs on one task, for all algorithms of a family alike.
+
+    ``settings`` are those of its simulation; others make another task, which `TaskVariant` names.
+    """
 
     settings: Mapping[str, Any]
     budget: Mapping[str, int]
@@ -101,6 +112,7 @@ class Config:
     """A validated configuration; see config/config.yaml for the meaning of each key."""
 
     tasks: tuple[str, ...]
+    task_variants: Mapping[str, TaskVariant]  # of those tasks that are not registered ones
     algorithms: Mapping[str, Variant]
     seeds: tuple[int, ...]
     budget: Mapping[str, int]
@@ -141,11 +153,13 @@ def parse(raw: Any) -> Config:
     evaluation = _Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
     wandb = _Section(top.get("wandb", {}), "wandb", ("mode", "project"))
     safe = _Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
+    tasks = _tasks(top.required("tasks"), "tasks")
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
         raise unknown("wandb mode", mode, WANDB_MODES)
     config = Config(
-        tasks=_names(top.required("tasks"), "tasks"),
+        tasks=tuple(tasks),
+        task_variants={name: variant for name, variant in tasks.items() if variant},
         algorithms=_variants(top.required("algorithms"), "algorithms"),
         seeds=_seeds(top.required("seeds"), "seeds"),
         budget=_budget(top.required("budget"), "budget"),
@@ -272,10 +286,50 @@ def _name(value: Any, where: str) -> str:
     return value
 
 
-def _names(value: Any, where: str) -> tuple[str, ...]:
-    names = tuple(_name(item, f"each of {where}") for item in _list(value, where))
-    _distinct(names, where)
-    return names
+def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
+    """Names of tasks, and what each is where it is no registered one.
+
+    A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
+    mapping of all names, those of registered tasks with nothing behind them.
+    """
+    entries: list[tuple[Any, Any]] = []
+    if isinstance(value, Mapping):
+        entries += value.items()
+        if not entries:
+            raise UserError(f"{where} is empty")
+    else:
+        for item in _list(value, where):
+            if isinstance(item, Mapping) and len(item) != 1:
+                raise UserError(
+                    f"each of {where} must be a name or one NAME: {{base, settings}}, "
+                    f"not {show(item)}"
+                )
+            entries += item.items() if isinstance(item, Mapping) else [(item, None)]
+    names = [_name(name, f"each of {where}") for name, _ in entries]
+    _distinct([name.lower() for name in names], where)
+    return {
+        name: _task_variant(entry, f"{where}.{name}")
+        for name, (_, entry) in zip(names, entries, strict=True)
+    }
+
+
+def _task_variant(value: Any, where: str) -> TaskVariant | None:
+    if value is None or value == {}:
+        return None
+    section = _Section(value, where, ("base", "settings"))
+    return TaskVariant(
+        _name(section.required("base"), f"{where}.base"),
+        _mapping(section.required("settings"), f"{where}.settings"),
+    )
+
+
+def task_name(value: Any, where: str) -> str:
+    """A name that a task may have.
+
+    Raises:
+        UserError: for anything else.
+    """
+    return _name(value, where)
 
 
 def _integer(value: Any, where: str, low: int, high: int = LARGEST_COUNT) -> int:

@@ -21,10 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr import records
+from safemr import records, reference
 from safemr.config import FAMILIES, Config, Variant, unknown
 from safemr.errors import UserError
 from safemr.strict_yaml import show
+from safemr.tasks import Described, Traits, base_of, name_of, settings_of, task_settings, traits
+from safemr.tasks import Task as TaskOrName
 
 _ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
 
@@ -58,7 +60,7 @@ class Plan:
     """All runs of a configuration.
 
     ``points`` maps the variant label of each sensitivity point to (a, b). A point that equals its
-    base variant is that variant: nothing is trained twice.
+    base variant is that variant: nothing is trained twice. ``tasks`` are those of its runs.
     """
 
     navigation: tuple[Run, ...]
@@ -66,6 +68,7 @@ class Plan:
     aircraft: tuple[Run, ...]
     outside: tuple[Run, ...]
     points: Mapping[str, tuple[float, float]]
+    tasks: Mapping[str, Described]
 
     @property
     def trained(self) -> tuple[Run, ...]:
@@ -131,7 +134,8 @@ def task_names() -> list[str]:
 
 
 @functools.cache
-def _task_version(name: str, settings_json: str) -> int:
+def _inspected(name: str, settings_json: str) -> tuple[int, Traits]:
+    """Version and traits of a registered task with these settings."""
     gymnasium = importlib.import_module("gymnasium")
     settings = json.loads(settings_json)
     try:
@@ -143,9 +147,9 @@ def _task_version(name: str, settings_json: str) -> int:
                 raise unknown("setting", setting, known, f"task {name}") from error
         reason = str(error).partition(" was raised from the environment creator")[0]
         raise UserError(f"task {name}: {reason.partition(chr(10))[0]}") from error
-    version = int(environment.unwrapped.task_version)
+    found = int(environment.unwrapped.task_version), traits(environment.unwrapped)
     environment.close()
-    return version
+    return found
 
 
 def _setting_names(name: str) -> list[str]:
@@ -157,15 +161,51 @@ def _setting_names(name: str) -> list[str]:
     return [p.name for p in parameters]
 
 
-def describe_task(name: str, settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """The ``task`` entry of a run's config: name, version and settings."""
-    if name not in task_names():
-        raise unknown("task", name, task_names(), where)
+def describe_task(
+    name: str, settings: Mapping[str, Any], where: str = "", *, base: str | None = None
+) -> dict[str, Any]:
+    """The ``task`` entry of a run's config: name, version and settings.
+
+    base: the registered task of which ``name`` is a variant; then the entry says it, too.
+    """
+    registered = name if base is None else base
+    if registered not in task_names():
+        raise unknown("task", registered, task_names(), where)
+    if base is not None and name.lower() in (known.lower() for known in task_names()):
+        raise UserError(f"{name!r} is the name of a registered task; give {where} another one")
     try:
         text = records.canonical_json(settings)
     except (TypeError, ValueError) as error:
         raise UserError(f"settings of task {name}: {error}") from error
-    return {"name": name, "version": _task_version(name, text), "settings": dict(settings)}
+    entry = {"name": name, "version": _inspected(registered, text)[0], "settings": dict(settings)}
+    return entry if base is None else {**entry, "base": base}
+
+
+def installed(task: TaskOrName) -> dict[str, Any]:
+    """The entry of a task as the installed environments have it: what a new run would say."""
+    base = None if name_of(task) == base_of(task) else base_of(task)
+    return describe_task(name_of(task), settings_of(task), base=base)
+
+
+def described(entry: Mapping[str, Any]) -> Described:
+    """A task's entry with the traits of its environment."""
+    found = _inspected(base_of(entry), records.canonical_json(settings_of(entry)))
+    return Described(entry, found[1])
+
+
+def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
+    """A registered task under its own name has its own settings, the simulation's apart.
+
+    Raises:
+        UserError: naming ``where`` and the setting that makes another task of it.
+    """
+    changed = task_settings(entry["settings"])
+    if "base" not in entry and changed:
+        name, value = next(iter(changed.items()))
+        raise UserError(
+            f"{where}: {name} = {show(value)} makes another task of {entry['name']}, which needs a "
+            f"name of its own: {remedy}"
+        )
 
 
 def hyperparameters(
@@ -277,6 +317,11 @@ def resolve(config: Config) -> Plan:
     aircraft: list[Run] = []
     if config.aircraft:
         part_of = config.aircraft
+        if part_of.task != reference.AIRCRAFT_TASK:
+            raise UserError(
+                f"aircraft.task = {part_of.task!r}: the experiment's truth is solved for "
+                f"{reference.AIRCRAFT_TASK} only; put other tasks into tasks"
+            )
         aircraft = list(
             resolver.grid(
                 part_of.task,
@@ -286,8 +331,17 @@ def resolve(config: Config) -> Plan:
                 "aircraft.task",
             )
         )
+    outside = tuple(resolver.outside())
+    entries = {
+        run.task: run.config["task"] for run in (*navigation, *sensitivity, *aircraft, *outside)
+    }
     plan = Plan(
-        tuple(navigation), tuple(sensitivity), tuple(aircraft), tuple(resolver.outside()), points
+        tuple(navigation),
+        tuple(sensitivity),
+        tuple(aircraft),
+        outside,
+        points,
+        {name: described(entry) for name, entry in entries.items()},
     )
     _check_distinct(plan)
     return plan
@@ -311,8 +365,10 @@ class _Resolver:
                 hyperparameters(
                     load_algorithm(variant.algorithm), variant.overrides, f"{section}.{label}"
                 )
+        for task in config.task_variants:
+            self._task(task, f"tasks.{task}")
         for task, overrides in config.task_overrides.items():
-            describe_task(task, overrides.settings, "task_overrides")
+            self._task(task, "task_overrides")
             for family, values in overrides.hyperparameters.items():
                 names = {
                     field.name
@@ -383,8 +439,27 @@ class _Resolver:
                     yield _run(described, algorithm, label, seed, entry.steps, **schedule)
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
-        overrides = self.config.task_overrides.get(name)
-        return describe_task(name, overrides.settings if overrides else {}, section)
+        """The entry of a task by its name in the configuration."""
+        overrides, variant = self.config.task_overrides.get(name), self.config.task_variants.get(name)
+        given = dict(overrides.settings) if overrides else {}
+        if variant is None:
+            if name not in task_names():
+                raise unknown("task", name, [*task_names(), *self.config.task_variants], section)
+            entry = describe_task(name, given, section)
+            shown = ", ".join(f"{key}: {value}" for key, value in task_settings(given).items())
+            remedy = f"tasks: {{NAME: {{base: {name}, settings: {{{shown[:80]}}}}}}}"
+            check_name(entry, f"task_overrides.{name}.settings", remedy)
+            return entry
+        where = f"tasks.{name}"
+        if not variant.settings:
+            raise UserError(f"{where}.settings is empty: then it is {variant.base} itself")
+        describe_task(variant.base, variant.settings, where)
+        if task_settings(given):
+            raise UserError(
+                f"task_overrides.{name}.settings: {next(iter(task_settings(given)))} belongs into "
+                f"{where}.settings"
+            )
+        return describe_task(name, {**variant.settings, **given}, where, base=variant.base)
 
     def _steps(self, task: str, family: str) -> int:
         overrides = self.config.task_overrides.get(task)
@@ -414,3 +489,8 @@ def _check_distinct(plan: Plan) -> None:
                 f"{labels[key]!r} and {run.variant!r} are the same algorithm with the same "
                 f"hyperparameters on {run.task}; remove one"
             )
+    names: dict[str, str] = {}
+    for name, task in plan.tasks.items():
+        same = records.canonical_json([base_of(task.entry), settings_of(task.entry)])
+        if names.setdefault(same, name) != name:
+            raise UserError(f"{names[same]!r} and {name!r} are the same task; remove one")

@@ -19,23 +19,10 @@ from typing import Any, TextIO
 
 from safemr import records, runs
 from safemr.checkpoints import CHECKPOINT, RunSession
-from safemr.config import WANDB_MODES
+from safemr.config import WANDB_MODES, task_name
 from safemr.errors import UserError, tell
 from safemr.strict_yaml import typed
-
-
-def make_envs(task: Mapping[str, Any], num_envs: int) -> Any:
-    """A batched environment of a run's task: the ``task`` entry of its config."""
-    import gymnasium as gym
-
-    import envs  # noqa: F401  registers the tasks
-
-    return gym.make_vec(
-        f"{task['name']}-v0",
-        num_envs=num_envs,
-        vectorization_mode="vector_entry_point",
-        **task["settings"],
-    )
+from safemr.tasks import make_envs
 
 
 class Progress:
@@ -135,6 +122,7 @@ def train(
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m safemr.train", description=__doc__)
     parser.add_argument("--task", help="for instance Pillars-0.15-Goal")
+    parser.add_argument("--task-name", help="what the task is called with settings of its own")
     parser.add_argument("--algorithm", help="a file in safemr/algorithms, for instance safemr")
     parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
     parser.add_argument("--steps", type=int, default=320_000, help="environment steps")
@@ -194,10 +182,11 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         for name in list(overrides)
         if name.startswith("task.")
     }
+    task = _task(arguments, settings)
     algorithm = runs.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
     run = runs.make_run(
-        runs.describe_task(arguments.task, settings, "--task"),
+        task,
         algorithm,
         runs.hyperparameters(algorithm, overrides, "--set"),
         variant=arguments.variant or arguments.algorithm,
@@ -211,6 +200,17 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         },
     )
     return json.loads(records.canonical_json(run.config)), run.variant
+
+
+def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The task's entry; settings that make another task of it need a name."""
+    if arguments.task_name is None:
+        task = runs.describe_task(arguments.task, settings, "--task")
+        runs.check_name(task, "--set", "give it with --task-name")
+        return task
+    name = task_name(arguments.task_name, "--task-name")
+    runs.describe_task(arguments.task, settings, "--task")
+    return runs.describe_task(name, settings, "--task-name", base=arguments.task)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -249,7 +249,8 @@ def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
     start = np.array([-0.9, -0.88]) * extent
     end = start + 0.3 * extent * np.array([np.cos(heading), np.sin(heading)])
     ax.annotate("", tuple(end), tuple(start), arrowprops={"arrowstyle": "->", "lw": 1})
-    ax.set(aspect="equal", xticks=[-2, 0, 2], yticks=[-2, 0, 2], xlabel="$x$ (m)")
+    tick = np.floor(extent) or extent
+    ax.set(aspect="equal", xticks=[-tick, 0, tick], yticks=[-tick, 0, tick], xlabel="$x$ (m)")
     ax.grid(False)
     figure = ax.get_figure()
     assert figure is not None
