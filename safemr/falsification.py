@@ -112,23 +112,33 @@ class Falsification:
         return float(self.infeasible[inside].mean()) if inside.any() else float("nan")
 
     def example(self) -> dict[str, Any]:
-        """The worst state as plain numbers, enough for `replay`."""
+        """The worst state as plain numbers, enough for `replay`.
+
+        What is not said of the task (base, settings) is that of the registered one.
+        """
         state = dict(zip(COLUMNS, map(float, self.worst_state), strict=True))
-        name, base, changed = name_of(self.task), base_of(self.task), settings_of(self.task)
-        task = {"task": name, **({"base": base} if base != name else {})}
-        if task_settings(changed):
-            task["settings"] = task_settings(changed)
+        name, base = name_of(self.task), base_of(self.task)
+        changed = task_settings(settings_of(self.task))
+        task: dict[str, Any] = {"task": name}
+        task |= {"base": base} if base != name else {}
+        task |= {"settings": changed} if changed else {}
         return {**task, **self.zeta._asdict(), "eta": self.eta, "state": state,
                 "margin": self.worst_margin}  # fmt: skip
 
 
 def falsify(
-    envs: Any, zeta: Zeta, *, eta: float = 0.0, count: int = 2**16, seed: int = 0, rounds: int = 12,
-    task: Task | None = None,
+    envs: Any,
+    task: Task,
+    zeta: Zeta,
+    *,
+    eta: float = 0.0,
+    count: int = 2**16,
+    seed: int = 0,
+    rounds: int = 12,
 ) -> Falsification:
     """Search `count` Sobol states, refine the worst, confirm in the simulator.
 
-    envs: `make_simulator` of the task, by default the registered one. Each round of the refinement perturbs the worst states, with
+    envs: `make_simulator` of ``task``. Each round of the refinement perturbs the worst states, with
     smaller steps than the last, and keeps what is worse. Raises UserError where phi stays positive
     far from the obstacle, so that the box of states has no end.
     """
@@ -164,7 +174,7 @@ def falsify(
     agree = (simulated >= 0) == (least(examined) >= 0)
     top = int(simulated.argmax())
     return Falsification(
-        task=task or envs.task.name, zeta=zeta, eta=eta, states=states, phi=energies(states, d_min, zeta),
+        task=task, zeta=zeta, eta=eta, states=states, phi=energies(states, d_min, zeta),
         margin=margin, worst_state=examined[top], worst_margin=float(simulated[top]),
         confirmed=int(agree.sum()), examined=len(examined),
     )  # fmt: skip
@@ -262,11 +272,17 @@ def simulated_margins(envs: Any, states: Array, zeta: Zeta, eta: float) -> Array
     return simulated_grid(envs, worlds, states[:, 4], phi, zeta, eta)[1].min(1)
 
 
+def task_of(example: Mapping[str, Any]) -> dict[str, Any]:
+    """The task on which an example was found."""
+    name = str(example["task"])
+    base = {"base": str(example["base"])} if "base" in example else {}
+    return {"name": name, "settings": dict(example.get("settings", {})), **base}
+
+
 def replay(example: Mapping[str, Any]) -> tuple[Array, Array]:
     """Actions [A, 2] of the grid and their g [A], in the simulator, in an example's state."""
     zeta = Zeta(example["sigma"], example["k"], example["n"])
-    task = {"name": str(example["task"]), "settings": example.get("settings", {})}
-    envs = make_simulator(task | {"base": str(example.get("base", task["name"]))})
+    envs = make_simulator(task_of(example))
     states = np.array([[float(example["state"][name]) for name in COLUMNS]])
     worlds, phi = worlds_near_obstacle(envs, states), energies(states, float(envs.d_min), zeta)
     actions, g = simulated_grid(envs, worlds, states[:, 4], phi, zeta, float(example["eta"]))

@@ -21,7 +21,7 @@ from safemr import records, runs
 from safemr.checkpoints import CHECKPOINT, RunSession
 from safemr.config import WANDB_MODES, task_name
 from safemr.errors import UserError, tell
-from safemr.strict_yaml import typed
+from safemr.strict_yaml import assignment
 from safemr.tasks import make_envs
 
 
@@ -152,13 +152,6 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _override(text: str) -> tuple[str, Any]:
-    name, separator, value = text.partition("=")
-    if not separator or not name:
-        raise UserError(f"--set {text}: write NAME=VALUE")
-    return name.strip(), typed(value)
-
-
 def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """The run's configuration and label from command-line arguments."""
     if arguments.resolved:
@@ -176,7 +169,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
-    overrides = dict(map(_override, arguments.set))
+    overrides = dict(map(assignment, arguments.set))
     settings = {
         name.removeprefix("task."): overrides.pop(name)
         for name in list(overrides)

@@ -20,12 +20,11 @@ with reported_errors():
     }
     papers = certify.paper_certificates() if params.paper else []
     jobs = [(certificate, certify.DEFAULT_TASK) for certificate in papers] + [*learned.values()]
-    for certificate, task in jobs:
-        row, example = certify.measured_certificate(
+    for title, (certificate, task) in zip(certify.example_titles(jobs), jobs, strict=True):
+        row, examples[title] = certify.measured_certificate(
             measurements, certificate, task, states=params.states, episodes=params.episodes
         )
         rows.append(row)
-        examples[f"{certificate.name} on {name_of(task)}"] = example
     chosen = [(certificate, certify.DEFAULT_TASK) for certificate in papers]
     chosen += [learned[folder] for folder in params.pictured] or jobs[-1:]
     # The map is that of the last one.
