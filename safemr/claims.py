@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from safemr import reference, statistics
+from safemr.conventions import COVERS
 from safemr.convergence import certificate_settles_last, losses_bounded
 from safemr.evidence import (
     NO_INTERVAL,
@@ -39,7 +40,6 @@ from safemr.statistics import Estimate
 from safemr.tables import Table, best_safe_baseline
 
 COLUMNS = ["estimate", "low", "high", "count"]
-COVERS = 0.01  # a certificate covers the true unsafe set if it misses at most this share of it
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,8 @@ def covers_true_set(evidence: Evidence) -> Finding:
     if absent:
         return absent
     missed = evidence.measured(reference.METHOD, "missed_share")
-    return at_most(statistics.mean_interval(missed, bounds=(0.0, 1.0)), COVERS, "missed share")
+    estimate = statistics.mean_interval(missed, bounds=(0.0, 1.0))
+    return at_most(estimate, COVERS, "missed share")
 
 
 def handcrafted_does_not_cover(evidence: Evidence) -> Finding:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
 from safemr.errors import UserError
 from safemr.strict_yaml import read_yaml, show, typed
 
@@ -167,7 +168,7 @@ def parse(raw: Any) -> Config:
         evaluation=Evaluation(
             _integer(evaluation.required("points"), "evaluation.points", 1),
             _integer(evaluation.required("episodes"), "evaluation.episodes", 1),
-            _integer(evaluation.get("seed", 10_000), "evaluation.seed", 0, LARGEST_SEED),
+            _integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
         ),
         unseen_layouts=_unseen(top.get("unseen_layouts")),
         task_overrides={
@@ -185,9 +186,11 @@ def parse(raw: Any) -> Config:
         allow_missing=_flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
         wandb_project=_name(wandb.get("project", "safemr"), "wandb.project"),
-        cost_tolerance=_number(safe.get("cost_tolerance", 1.0), "safe.cost_tolerance", 0, math.inf),
+        cost_tolerance=_number(
+            safe.get("cost_tolerance", COST_TOLERANCE), "safe.cost_tolerance", 0, math.inf
+        ),
         zero_violation_share=_number(
-            safe.get("zero_violation_share", 0.95), "safe.zero_violation_share", 0, 1
+            safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
     )
     if config.log_points % config.evaluation.points:
@@ -401,7 +404,7 @@ def _unseen(value: Any) -> UnseenLayouts | None:
     section = _Section(value, "unseen_layouts", ("episodes", "seed"))
     return UnseenLayouts(
         _integer(section.required("episodes"), "unseen_layouts.episodes", 1),
-        _integer(section.get("seed", 20_000), "unseen_layouts.seed", 0, LARGEST_SEED),
+        _integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
     )
 
 

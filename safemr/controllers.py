@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from safemr import reference
 from safemr.evaluate import evaluate
 from safemr.measurements import Measurements
-from safemr.point_robot import PointRobot
+from safemr.point_robot import ROBOT
 from safemr.runs import installed
 from safemr.tasks import Task, make_envs, name_of, traits
 
 Array = NDArray[np.float64]
 
-ROBOT = PointRobot()
 SCORE_COLUMNS = ["task", "variant", "seed", "metric", "value"]
 CRUISE = 1.0  # m/s on the way
 PUSH_SPEED = 0.5  # m/s while pushing; faster loses the box

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from safemr.energy import constraint, energy, largest
 from safemr.errors import UserError
 from safemr.evaluate import Acts
-from safemr.point_robot import PointRobot
+from safemr.point_robot import ROBOT
 from safemr.reference import Zeta
 from safemr.tasks import Task, base_of, make_envs, name_of, settings_of, task_settings, traits
 
@@ -35,7 +35,6 @@ Worlds = Mapping[str, NDArray[Any]]  # `envs.get_state()["worlds"]`: arrays with
 
 COLUMNS = ("distance", "bearing", "course", "speed", "turn_rate")
 FAR_AWAY = 100.0  # m, where the objects stand that play no part
-ROBOT = PointRobot()
 
 # The action grid: thrust saturates at |a0| = 0.05, so a0 is gridded inside that. The yaw torque is
 # limited too and varies only for a1 within 0.05 of 0.3 psi_dot; there a1 is gridded densely, beside

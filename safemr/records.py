@@ -162,11 +162,16 @@ def write_record(
     atomic.write(folder / PROVENANCE, text.encode())
 
 
-def load_policy(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused."""
+def policy_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused.
+
+    Raises UserError where there is no such file, or none that can be read.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such policy; train the run first") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is not a readable policy file: {error}") from error
 

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from safemr import reference, statistics
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE
 from safemr.statistics import Estimate
 
 FEW = (
@@ -57,8 +58,8 @@ class SafetyRule:
     task, whereas the authors' cost is a contact count on one and a depth on the other.
     """
 
-    tolerance: float = 1.0  # mean violating steps an episode, at most
-    clean_share: float = 0.95  # mean share of episodes without any violation, at least
+    tolerance: float = COST_TOLERANCE  # mean violating steps an episode, at most
+    clean_share: float = CLEAN_SHARE  # mean share of episodes without any violation, at least
     cost: str = "eval_cost_indicator"
     clean: str = "eval_zero_violation_share"
 

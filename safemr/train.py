@@ -20,6 +20,7 @@ from typing import Any, TextIO
 from safemr import records, runs
 from safemr.checkpoints import CHECKPOINT, RunSession
 from safemr.config import WANDB_MODES, task_name
+from safemr.conventions import EVALUATION_SEED
 from safemr.errors import UserError, tell
 from safemr.strict_yaml import assignment
 from safemr.tasks import make_envs
@@ -135,7 +136,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--log-points", type=int, default=20, help="rows of progress.csv")
     parser.add_argument("--eval-episodes", type=int, default=10)
-    parser.add_argument("--eval-seed", type=int, default=10_000)
+    parser.add_argument("--eval-seed", type=int, default=EVALUATION_SEED)
     parser.add_argument(
         "--resolved", help="a run's complete configuration as JSON, or a file of it"
     )

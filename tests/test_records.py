@@ -73,7 +73,7 @@ def test_a_written_record_is_verified_and_read(record: Path, tmp_path: Path) -> 
     assert list(progress) == ["task", "variant", "seed", "step", "metric", "value"]
     assert len(progress) == 6
     np.testing.assert_array_equal(
-        records.load_policy(record / "policy.npz")["weights"], POLICY["weights"]
+        records.policy_arrays(record / "policy.npz")["weights"], POLICY["weights"]
     )
 
 

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from safemr.energy import constraint, energy, largest
 from safemr.feasibility import radial_requirement
 from safemr.plotting import style
-from safemr.point_robot import PointRobot
+from safemr.point_robot import ROBOT
 from safemr.reference import Zeta
 
 Array = NDArray[np.float64]
 
-ROBOT = PointRobot()
 _PAPER = ("#000000", "#7A7A7A", "#B5B5B5")  # the paper's three sets
 _HANDCRAFTED = {"phi_0": "FAC-phi0", "phi_h": "FAC-phih"}
 

@@ -79,7 +79,9 @@ rule claims:
         scores=rules.aggregate.output.scores,
         progress=rules.aggregate.output.progress,
         certificates=rules.certificates.output.table[0] if WITH_PAPERS or FIRST_RUNS else [],
-        aircraft=f"{SUMMARY}/aircraft.csv" if CONFIG.aircraft else [],
+        aircraft=f"{SUMMARY}/aircraft.csv"
+        if CONFIG.aircraft and CONFIG.aircraft.task == reference.AIRCRAFT_TASK
+        else [],
     output:
         table=expand(f"{RESULTS}/tables/claims.{{end}}", end=["csv", "tex"]),
         markdown=report(
