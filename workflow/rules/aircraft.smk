@@ -18,6 +18,7 @@ rule aircraft_frontier:
     params:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
+        sources=sources("aircraft_frontier"),
     message:
         "Solving the aircraft's true unsafe sets and the frontier of the energy family"
     script:
@@ -43,6 +44,7 @@ rule aircraft_comparison:
         root=RESULTS,
         folders=[run.path.as_posix() for run in AIRCRAFT],
         expected=expected(AIRCRAFT_PLAN),
+        sources=sources("aircraft_comparison"),
     message:
         "Comparing %d learned certificates with the true unsafe set" % len(AIRCRAFT)
     script:
@@ -66,6 +68,7 @@ rule aircraft_figures:
     params:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
+        sources=sources("aircraft_figures"),
     script:
         "../scripts/aircraft_figures.py"
 
@@ -98,6 +101,7 @@ rule aircraft_neural:
         folders=[run.path.as_posix() for run in NEURAL],
         expected=expected(NEURAL_PLAN),
         energy=[run.config["algorithm"]["hyperparameters"] for run in NEURAL_PLAN[:1]],
+        sources=sources("aircraft_neural"),
     message:
         "Comparing %d neural certificates with the true unsafe set" % len(NEURAL)
     script:

@@ -27,6 +27,7 @@ rule controllers:
         settings=SETTINGS,
         seeds=min(5, CONFIG.evaluation.episodes),
         episodes=CONFIG.evaluation.episodes,
+        sources=sources("controllers"),
     message:
         "Evaluating the scripted controllers"
     script:
@@ -59,6 +60,7 @@ rule certificates:
         pictured=[run.path.as_posix() for run in FIRST_RUNS.values() if run.variant in LEARNED],
         states=2**13,
         episodes=min(8, CONFIG.evaluation.episodes),
+        sources=sources("certificates"),
     message:
         "Checking the paper's certificates and %d learned ones" % len(FIRST_RUNS)
     script:
@@ -85,6 +87,7 @@ rule claims:
         points={label: list(point) for label, point in PLAN.points.items()},
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("claims"),
     script:
         "../scripts/claims.py"
 

@@ -35,6 +35,7 @@ rule table_1:
         expected=expected((*PLAN.navigation, *PLAN.outside)),
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("tables"),
     script:
         "../scripts/tables.py"
 
@@ -55,6 +56,7 @@ rule training_curves:
     params:
         **GRID,
         **BUDGET,
+        sources=sources("training_curves"),
     script:
         "../scripts/training_curves.py"
 
@@ -79,6 +81,7 @@ rule illustrations:
     threads: 1
     params:
         tasks=ROBOT_TASKS,
+        sources=sources("illustrations"),
     script:
         "../scripts/illustrations.py"
 
@@ -96,6 +99,7 @@ rule compute_curves:
     params:
         **GRID,
         **BUDGET,
+        sources=sources("compute_curves"),
     script:
         "../scripts/compute_curves.py"
 
@@ -113,6 +117,7 @@ rule final_scores:
         **BUDGET,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("final_scores"),
     script:
         "../scripts/final_scores.py"
 
@@ -129,6 +134,7 @@ rule parameters:
         **BUDGET,
         tasks=GRID["tasks"],
         learned=LEARNED,
+        sources=sources("parameters"),
     script:
         "../scripts/parameters.py"
 
@@ -150,6 +156,7 @@ rule certificate_paths:
             for run in PLAN.navigation
             if run.variant in LEARNED and run.task == CONFIG.tasks[0]
         },
+        sources=sources("certificate_paths"),
     script:
         "../scripts/certificate_paths.py"
 
@@ -178,6 +185,7 @@ rule rollouts:
         settings=lambda wildcards: SETTINGS.get(wildcards.task, {}),
         layouts=[CONFIG.evaluation.seed + index for index in range(4)],
         steps=400,
+        sources=sources("rollouts"),
     script:
         "../scripts/rollouts.py"
 
@@ -196,6 +204,7 @@ rule policies:
         tasks=ROBOT_TASKS,
         variants=LEARNED,
         steps=300,
+        sources=sources("policies"),
     script:
         "../scripts/policies.py"
 
