@@ -60,12 +60,13 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     if cut.adversarial is not None:
         ax.contour(x, y, cut.adversarial.T, levels=[0], colors=[TRUE], linewidths=0.7,
                    linestyles=[(0, (4, 2))], zorder=3)  # fmt: skip
-    ax.contour(x, y, style.steady(cut.handcrafted).T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
+    handcrafted = style.steady(cut.handcrafted)
+    ax.contour(x, y, handcrafted.T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
                linewidths=1.2, linestyles=[(0, (1.5, 1))], zorder=5)  # fmt: skip
     for variant in reversed(style.ordered(cut.learned)):
         for phi in cut.learned[variant]:
-            ax.contour(x, y, style.steady(phi).T, levels=[0], colors=[style.colour(variant)], linewidths=1.0,
-                       linestyles=[_dash(variant)], zorder=6)  # fmt: skip
+            ax.contour(x, y, style.steady(phi).T, levels=[0], colors=[style.colour(variant)],
+                       linewidths=1.0, linestyles=[_dash(variant)], zorder=6)  # fmt: skip
     draw_aircraft(ax, 0.0, 0.0, 0.0, "#0072B2")
     ax.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.xaxis.set_major_locator(MultipleLocator(5))

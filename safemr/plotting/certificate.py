@@ -149,8 +149,8 @@ def narrow_passage(
     figure.colorbar(image, ax=maps, pad=0.02, label="admissible speed (m/s)", shrink=0.9)
     path = np.stack([np.linspace(-1.3, 1.3, 521), np.zeros(521)], -1)
     for letter, (_, zeta), (tint, dash) in zip("ab", (conservative, efficient), looks, strict=True):
-        speed = admissible_speed(path, obstacles, zeta, d_min, ahead)
-        line.plot(path[:, 0], np.nan_to_num(style.steady(speed)), color=tint, ls=dash, label=f"({letter})")
+        speed = style.steady(admissible_speed(path, obstacles, zeta, d_min, ahead))
+        line.plot(path[:, 0], np.nan_to_num(speed), color=tint, ls=dash, label=f"({letter})")
     line.set(xlabel="$x$ on the middle line (m)", ylabel="admissible speed (m/s)")
     line.set(xlim=(-1.3, 1.3), ylim=(-0.03, 1.1 * ROBOT.max_speed), box_aspect=2.3 / 2.6)
     line.legend(loc="center right")
