@@ -83,5 +83,7 @@ def _point(xy: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _rotated(points: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
+    # In double precision whatever the pose has: single sines differ between processors by enough
+    # to change a printed coordinate.
+    c, s = np.cos(np.float64(angle)), np.sin(np.float64(angle))
     return points @ np.array([[c, s], [-s, c]])

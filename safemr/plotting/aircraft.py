@@ -47,7 +47,7 @@ def draw_aircraft(
     left = np.column_stack([_OUTLINE_X, _OUTLINE_Y])
     outline = np.concatenate([left, left[-2:0:-1] * [1, -1]])
     turn = np.array([[np.cos(psi), np.sin(psi)], [-np.sin(psi), np.cos(psi)]])
-    points = length * outline @ turn + [x, y]
+    points = style.steady(length * outline @ turn + [x, y])
     ax.add_patch(Polygon(points, closed=True, fc=colour, ec="white", lw=0.4, zorder=9))
     return ax
 
@@ -60,12 +60,13 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     if cut.adversarial is not None:
         ax.contour(x, y, cut.adversarial.T, levels=[0], colors=[TRUE], linewidths=0.7,
                    linestyles=[(0, (4, 2))], zorder=3)  # fmt: skip
-    ax.contour(x, y, cut.handcrafted.T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
+    handcrafted = style.steady(cut.handcrafted)
+    ax.contour(x, y, handcrafted.T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
                linewidths=1.2, linestyles=[(0, (1.5, 1))], zorder=5)  # fmt: skip
     for variant in reversed(style.ordered(cut.learned)):
         for phi in cut.learned[variant]:
-            ax.contour(x, y, phi.T, levels=[0], colors=[style.colour(variant)], linewidths=1.0,
-                       linestyles=[_dash(variant)], zorder=6)  # fmt: skip
+            ax.contour(x, y, style.steady(phi).T, levels=[0], colors=[style.colour(variant)],
+                       linewidths=1.0, linestyles=[_dash(variant)], zorder=6)  # fmt: skip
     draw_aircraft(ax, 0.0, 0.0, 0.0, "#0072B2")
     ax.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.xaxis.set_major_locator(MultipleLocator(5))
@@ -130,9 +131,9 @@ def single(x: Array, y: Array, cut: Slice, d_min: float) -> Figure:
     place = (x[-1] - 2.6, y[-1] - 2.2)
     draw_aircraft(ax, *place, cut.psi, TRUE)
     for at, angle, tint in (((0.0, 0.0), 0.0, "#0072B2"), (place, cut.psi, TRUE)):
-        tip = (at[0] + 3.6 * np.cos(angle), at[1] + 3.6 * np.sin(angle))
+        tip = style.steady([at[0] + 3.6 * np.cos(angle), at[1] + 3.6 * np.sin(angle)])
         ax.annotate(
-            "", tip, at, arrowprops={"arrowstyle": "->", "color": tint, "lw": 0.9}, zorder=8
+            "", tuple(tip), at, arrowprops={"arrowstyle": "->", "color": tint, "lw": 0.9}, zorder=8
         )
     ax.set(xlabel="$x$ ahead of the evader (m)", ylabel="$y$ to its left (m)")
     figure.legend(handles=_handles(cut), loc="outside lower center", ncols=2)

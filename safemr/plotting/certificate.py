@@ -11,10 +11,10 @@ from matplotlib.colors import ListedColormap, TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from safemr.energy import constraint, energy, largest
-from safemr.feasibility import radial_requirement
+from safemr.feasibility import CONVENTIONS, radial_requirement
 from safemr.plotting import style
 from safemr.point_robot import ROBOT
 from safemr.reference import Zeta
@@ -39,11 +39,11 @@ def radial_drive(distance: float, d_dot: float, zeta: Zeta, d_min: float, steps:
     thrusts = np.linspace(-ROBOT.thrust, ROBOT.thrust, 41)
     for _ in range(steps):
         d, rate = path[-1]
-        phi = float(energy(d, rate, d_min, *zeta))
+        phi = float(_phi(d, rate, d_min, zeta))
         options = [_radial_step(d, rate, thrust) for thrust in thrusts]
-        safe = [(d, v) for d, v in options if constraint(phi, energy(d, v, d_min, *zeta), 0.0) < 0]
+        safe = [(d, v) for d, v in options if constraint(phi, _phi(d, v, d_min, zeta), 0.0) < 0]
         path.append(safe[0] if safe and phi <= 0 else options[-1])
-        if path[0][1] < 0 < path[-1][1] and energy(path[-1][0], path[-1][1], d_min, *zeta) < -0.1:
+        if path[0][1] < 0 < path[-1][1] and _phi(*path[-1], d_min, zeta) < -0.1:
             break
     return np.array(path)
 
@@ -58,7 +58,7 @@ def energy_and_safe_set(zeta: Zeta, d_min: float) -> Figure:
     figure = style.new_figure(style.TEXT_WIDTH, 2.7)
     plane, time = figure.subplots(1, 2, width_ratios=[1.35, 1])
     d, rate = np.meshgrid(np.linspace(0, 1.6, 241), np.linspace(-1.5, 0.75, 181))
-    phi = energy(d, rate, d_min, *zeta)
+    phi = _phi(d, rate, d_min, zeta)
     norm = TwoSlopeNorm(0.0, phi.min(), phi.max())
     image = plane.contourf(d, rate, phi, levels=24, cmap="RdBu_r", norm=norm)
     image.set_edgecolor("face")
@@ -74,7 +74,7 @@ def energy_and_safe_set(zeta: Zeta, d_min: float) -> Figure:
         plane.plot(*path[0], marker="o", color="k", ms=3.5)
         plane.annotate("", path[6], path[4], arrowprops={"arrowstyle": "->", "lw": 1})
         seconds = ROBOT.step_s * np.arange(len(path))
-        phi_along = energy(path[:, 0], path[:, 1], d_min, *zeta)
+        phi_along = _phi(path[:, 0], path[:, 1], d_min, zeta)
         time.plot(seconds, phi_along, color="k", ls=line, label=name)
     plane.set(xlabel="distance $d$ (m)", ylabel=r"rate $\dot d$ (m/s)", xlim=(0, 1.6))
     plane.grid(False)
@@ -111,9 +111,9 @@ def admissible_speed(
     at_rest = energy(d, 0.0 * d, d_min, *zeta)
     slope = energy(d, rate, d_min, *zeta) - at_rest
     with np.errstate(divide="ignore", invalid="ignore"):
-        limits = np.where(slope > 0, -at_rest / slope, np.inf)
+        limits = np.where(style.steady(slope) > 0, -at_rest / slope, np.inf)
     speed = np.minimum(limits.min(-1), ROBOT.max_speed)
-    return np.where(largest(at_rest) > 0, np.nan, speed)
+    return np.where(largest(style.steady(at_rest)) > 0, np.nan, speed)
 
 
 @style.styled
@@ -132,7 +132,7 @@ def narrow_passage(
     *maps, line = figure.subplots(1, 3, width_ratios=[1, 1, 1])
     looks = (("#0072B2", "--"), ("#D55E00", "-"))
     for ax, (name, zeta) in zip(maps, (conservative, efficient), strict=True):
-        speed = admissible_speed(positions, obstacles, zeta, d_min, ahead)
+        speed = style.steady(admissible_speed(positions, obstacles, zeta, d_min, ahead))
         image = ax.pcolormesh(x, y, speed, cmap="viridis", vmin=0, vmax=ROBOT.max_speed,
                               shading="gouraud", rasterized=True)  # fmt: skip
         blocked = np.isnan(speed).astype(float)
@@ -148,8 +148,8 @@ def narrow_passage(
     figure.colorbar(image, ax=maps, pad=0.02, label="admissible speed (m/s)", shrink=0.9)
     path = np.stack([np.linspace(-1.3, 1.3, 521), np.zeros(521)], -1)
     for letter, (_, zeta), (tint, dash) in zip("ab", (conservative, efficient), looks, strict=True):
-        speed = np.nan_to_num(admissible_speed(path, obstacles, zeta, d_min, ahead))
-        line.plot(path[:, 0], speed, color=tint, ls=dash, label=f"({letter})")
+        speed = style.steady(admissible_speed(path, obstacles, zeta, d_min, ahead))
+        line.plot(path[:, 0], np.nan_to_num(speed), color=tint, ls=dash, label=f"({letter})")
     line.set(xlabel="$x$ on the middle line (m)", ylabel="admissible speed (m/s)")
     line.set(xlim=(-1.3, 1.3), ylim=(-0.03, 1.1 * ROBOT.max_speed), box_aspect=2.3 / 2.6)
     line.legend(loc="center right")
@@ -179,8 +179,11 @@ def draw_requirement(zetas: Mapping[str, Zeta], d_min: float, ax: Axes) -> Axes:
         paper = given.startswith("paper") and next(papers, None)
         tint = paper or style.colour(variant)
         if zeta.k > 0:
-            ax.plot(u, radial_requirement(zeta, d_min, u, "inside"), color=tint, label=name)
-            ax.plot(u, radial_requirement(zeta, d_min, u, "outside"), color=tint, ls="--", lw=0.8)
+            inside, outside = (
+                style.steady(radial_requirement(zeta, d_min, u, where)) for where in CONVENTIONS
+            )
+            ax.plot(u, inside, color=tint, label=name)
+            ax.plot(u, outside, color=tint, ls="--", lw=0.8)
         else:
             ax.plot([], [], ls="none", label=f"{name}: no finite value ($k=0$)")
     ax.plot([], [], color="0.5", lw=0.8, ls="--", label=r"dashed: $C=\sigma+d_{\min}^n$")
@@ -246,7 +249,7 @@ def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
     ax.add_patch(goal)
     heading, extent = float(data["heading"]), float(data["extent"])
     start = np.array([-0.9, -0.88]) * extent
-    end = start + 0.3 * extent * np.array([np.cos(heading), np.sin(heading)])
+    end = start + 0.3 * extent * style.steady([np.cos(heading), np.sin(heading)])
     ax.annotate("", tuple(end), tuple(start), arrowprops={"arrowstyle": "->", "lw": 1})
     tick = np.floor(extent) or extent
     ax.set(aspect="equal", xticks=[-tick, 0, tick], yticks=[-tick, 0, tick], xlabel="$x$ (m)")
@@ -283,6 +286,11 @@ def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence
     }
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
     return figure
+
+
+def _phi(d: ArrayLike, d_dot: ArrayLike, d_min: float, zeta: Zeta) -> Array:
+    """The energy as it is drawn and decided on in drawings: the same on every machine."""
+    return style.steady(energy(d, d_dot, d_min, *zeta))
 
 
 def _math(name: str) -> str:

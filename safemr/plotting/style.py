@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
+from numpy.typing import ArrayLike, NDArray
 
 COLUMN_WIDTH = 3.5  # inches, one column of the paper
 TEXT_WIDTH = 7.16  # inches, both columns
@@ -130,6 +132,17 @@ def new_figure(width: float, height: float) -> Figure:
 def row_width(panels: int) -> float:
     """Width in inches, of those that a page has, of a row of square panels."""
     return (COLUMN_WIDTH, 0.8 * TEXT_WIDTH, TEXT_WIDTH)[min(panels, 3) - 1]
+
+
+def steady(values: ArrayLike) -> NDArray[np.float64]:
+    """Values of a drawing in metres, seconds or the like, to a millionth; nan stays nan.
+
+    Powers and sines differ between processors in their last bits, which decide where a contour
+    passes a node of the grid, and with it some pixels. What comes from such a function is rounded
+    before it is drawn, or compared with a threshold, so that every machine draws the same bytes:
+    to a multiple of 2^-20, because round decimals, which grids have, are never halfway between two.
+    """
+    return np.round(np.asarray(values, np.float64) * 2.0**20) / 2.0**20
 
 
 def thousands(ax: Axes) -> None:

@@ -23,6 +23,7 @@ rule aggregate:
     params:
         root=RESULTS,
         folders=[run.path.as_posix() for run in RECORDED],
+        sources=sources("aggregate"),
     message:
         "Verifying and aggregating the records of %d runs" % len(RECORDED)
     script:

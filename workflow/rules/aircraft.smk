@@ -22,6 +22,7 @@ rule aircraft_frontier:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
         task=ENCOUNTER,
+        sources=sources("aircraft_frontier"),
     message:
         "Solving the aircraft's true unsafe sets and the frontier of the energy family"
     script:
@@ -48,6 +49,7 @@ rule aircraft_comparison:
         root=RESULTS,
         folders=[run.path.as_posix() for run in AIRCRAFT],
         expected=expected(AIRCRAFT_PLAN),
+        sources=sources("aircraft_comparison"),
     message:
         "Comparing %d learned certificates with the true unsafe set" % len(AIRCRAFT)
     script:
@@ -72,6 +74,7 @@ rule aircraft_figures:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
         task=ENCOUNTER,
+        sources=sources("aircraft_figures"),
     script:
         "../scripts/aircraft_figures.py"
 
@@ -105,6 +108,7 @@ rule aircraft_neural:
         folders=[run.path.as_posix() for run in NEURAL],
         expected=expected(NEURAL_PLAN),
         energy=[run.config["algorithm"]["hyperparameters"] for run in NEURAL_PLAN[:1]],
+        sources=sources("aircraft_neural"),
     message:
         "Comparing %d neural certificates with the true unsafe set" % len(NEURAL)
     script:

@@ -14,6 +14,7 @@ from safemr.errors import UserError
 from safemr.records import REQUIRED_FILES
 from safemr.plan_cache import plan_for
 from safemr import reference
+from safemr.sources import digest
 
 # A file given by --configfile replaces whole top-level keys of the default, so that it can also
 # leave something out; Snakemake's own `configfile:` would merge the two entry by entry.
@@ -59,3 +60,8 @@ def expected(runs):
 def one_of(names):
     """A wildcard constraint: one of some literal names."""
     return "|".join(re.escape(name) for name in sorted(set(names))) or "(?!)"
+
+
+def sources(script):
+    """A digest of what workflow/scripts/<script>.py uses: an edit there runs its rule again."""
+    return digest(os.path.join(workflow.basedir, f"workflow/scripts/{script}.py"))

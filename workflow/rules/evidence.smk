@@ -31,6 +31,7 @@ rule controllers:
         tasks=entries_of(ROBOT_TASKS),
         seeds=min(5, CONFIG.evaluation.episodes),
         episodes=CONFIG.evaluation.episodes,
+        sources=sources("controllers"),
     message:
         "Evaluating the scripted controllers"
     script:
@@ -68,6 +69,7 @@ rule certificates:
         ],
         states=2**13,
         episodes=min(8, CONFIG.evaluation.episodes),
+        sources=sources("certificates"),
     message:
         "Checking %d learned certificates%s" % (len(FIRST_RUNS), " and the paper's" * WITH_PAPERS)
     script:
@@ -100,6 +102,7 @@ rule claims:
         },
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("claims"),
     script:
         "../scripts/claims.py"
 

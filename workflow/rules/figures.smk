@@ -37,6 +37,7 @@ rule table_1:
         expected=expected((*PLAN.navigation, *PLAN.outside)),
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("tables"),
     script:
         "../scripts/tables.py"
 
@@ -57,6 +58,7 @@ rule training_curves:
     params:
         **GRID,
         **BUDGET,
+        sources=sources("training_curves"),
     script:
         "../scripts/training_curves.py"
 
@@ -90,6 +92,7 @@ rule illustrations:
     threads: 1
     params:
         tasks=entries_of(ROBOT_TASKS),
+        sources=sources("illustrations"),
     script:
         "../scripts/illustrations.py"
 
@@ -107,6 +110,7 @@ rule compute_curves:
     params:
         **GRID,
         **BUDGET,
+        sources=sources("compute_curves"),
     script:
         "../scripts/compute_curves.py"
 
@@ -124,6 +128,7 @@ rule final_scores:
         **BUDGET,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("final_scores"),
     script:
         "../scripts/final_scores.py"
 
@@ -140,6 +145,7 @@ rule parameters:
         **BUDGET,
         tasks=GRID["tasks"],
         learned=LEARNED,
+        sources=sources("parameters"),
     script:
         "../scripts/parameters.py"
 
@@ -161,6 +167,7 @@ rule certificate_paths:
             for run in PLAN.navigation
             if run.variant in LEARNED and run.task == CONFIG.tasks[0]
         },
+        sources=sources("certificate_paths"),
     script:
         "../scripts/certificate_paths.py"
 
@@ -188,6 +195,7 @@ rule rollouts:
         },
         layouts=[CONFIG.evaluation.seed + index for index in range(4)],
         steps=lambda wildcards: min(400, PLAN.tasks[wildcards.task].traits.episode_steps),
+        sources=sources("rollouts"),
     script:
         "../scripts/rollouts.py"
 
@@ -206,6 +214,7 @@ rule policies:
         tasks=ROBOT_TASKS,
         variants=LEARNED,
         steps=300,
+        sources=sources("policies"),
     script:
         "../scripts/policies.py"
 

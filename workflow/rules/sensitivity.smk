@@ -18,6 +18,7 @@ rule sensitivity:
     threads: 1
     params:
         **LEARNED_AT_POINTS,
+        sources=sources("sensitivity"),
     script:
         "../scripts/sensitivity.py"
 
@@ -38,6 +39,7 @@ rule weight_map:
         **LEARNED_AT_POINTS,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("weight_map"),
     script:
         "../scripts/weight_map.py"
 

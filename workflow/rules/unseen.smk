@@ -20,6 +20,7 @@ rule unseen_layouts:
         folders=lambda wildcards: list(FLOWN[wildcards.task]),
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
         seed=CONFIG.unseen_layouts and CONFIG.unseen_layouts.seed,
+        sources=sources("unseen_layouts"),
     message:
         "Flying the final policies of {wildcards.task} on {params.episodes} unseen layouts"
     script:
@@ -52,6 +53,7 @@ rule unseen_table:
         layouts=CONFIG.evaluation.episodes,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
+        sources=sources("unseen_table"),
     script:
         "../scripts/unseen_table.py"
 
