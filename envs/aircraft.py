@@ -15,6 +15,7 @@ unconstrained optimum ignores the traffic, and safety is all that there is to le
 
 from __future__ import annotations
 
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -134,6 +135,8 @@ class _Encounters(Independent):
     """N independent encounters: everything that the scalar and the batched environment share."""
 
     def __init__(self, num_envs: int, other_turn: float, step_limit: int) -> None:
+        if isinstance(other_turn, bool) or not isinstance(other_turn, int | float):
+            raise ValueError(f"{NAME}: other_turn must be a number [rad/s], got {other_turn!r}")
         self.dynamics = AircraftDynamics(other_turns=(float(other_turn),))
         self.num_envs = num_envs
         self.generators = [seeding.np_random()[0] for _ in range(num_envs)]
@@ -159,13 +162,13 @@ class _Encounters(Independent):
                 self.reset(index)
             return
         try:
-            placed = np.array(options["state"], float).reshape(-1, 3)
+            placed = np.array(options["state"], float).reshape(self.states.shape)
         except (TypeError, ValueError):
-            placed = np.full((0, 3), np.nan)
-        if placed.shape != self.states.shape or not np.all(np.isfinite(placed[mask])):
+            placed = np.full_like(self.states, np.nan)
+        if not np.all(np.isfinite(placed[mask])):
             raise ValueError(
                 f"{NAME}: options['state'] must be {self.num_envs} finite states [x, y, psi], "
-                f"not an array of shape {np.shape(options['state'])}"
+                f"not {reprlib.repr(options['state'])}"
             )
         self.states[mask], self.steps[mask] = placed[mask], 0
 
@@ -250,6 +253,7 @@ class _Aircraft:
 
     d_min = AircraftDynamics.d_min
     num_obstacles = 1
+    setting_names = ("max_episode_steps", "other_turn")
     task_version = 2  # 1: leaving the box truncated
     observation_layout: ClassVar[dict[str, slice]] = {
         "position": slice(0, 2),

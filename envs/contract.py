@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -30,17 +30,6 @@ Floats = NDArray[np.float64]
 Actions = NDArray[np.float32]
 
 
-class Simulation(Protocol):
-    """What a scalar environment and a batch run: N worlds without autoreset."""
-
-    generators: list[np.random.Generator]
-    step_limit: int  # an episode of so many steps is truncated
-
-    def get_state(self) -> dict[str, Any]: ...
-
-    def set_state(self, state: Mapping[str, Any]) -> None: ...
-
-
 class Independent:
     """Objects of which a shallow copy would move the original: every copy is a deep one."""
 
@@ -49,7 +38,11 @@ class Independent:
 
 
 class ScalarEnvironment(Independent, gymnasium.Env[Floats, Actions]):
-    """One world. Subclasses set `_name` and `_simulation`, and guard `step` by `_running`."""
+    """One world. Subclasses set `_name` and `_simulation`, and guard `step` by `_running`.
+
+    The simulation is N worlds without autoreset (here one): it has `generators`, one a world,
+    `step_limit`, the length of an episode, `get_state` and `set_state`.
+    """
 
     options: ClassVar[tuple[str, ...]] = ()  # known to `reset`
     _name: str
@@ -67,7 +60,7 @@ class ScalarEnvironment(Independent, gymnasium.Env[Floats, Actions]):
         limit: int = self._simulation.step_limit
         return None if limit == NO_LIMIT else limit
 
-    @property  # type: ignore[override]
+    @property
     def spec(self) -> EnvSpec | None:
         """Set by `gymnasium.make`, without a time limit: that of TimeLimit is to be the only one.
 
@@ -136,7 +129,7 @@ class BatchEnvironment(Independent, VectorEnv[Floats, Actions, Any]):
     `step` by `_started`."""
 
     options: ClassVar[tuple[str, ...]] = (RESET_MASK,)
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012
     _name: str
     _simulation: Any
     _spec: EnvSpec | None = None
@@ -155,7 +148,7 @@ class BatchEnvironment(Independent, VectorEnv[Floats, Actions, Any]):
         """The steps after which an episode is truncated."""
         return int(self._simulation.step_limit)
 
-    @property  # type: ignore[override]
+    @property
     def spec(self) -> EnvSpec | None:
         """What `gymnasium.make_vec` made it from, with the time limit that holds."""
         return self._spec
@@ -224,7 +217,9 @@ def reset_needed(name: str) -> Exception:
 
 
 def closed(name: str) -> Exception:
-    return gymnasium.error.ClosedEnvironmentError(f"{name}: the environment is closed; make another")
+    return gymnasium.error.ClosedEnvironmentError(
+        f"{name}: the environment is closed; make another"
+    )
 
 
 def checked_limit(name: str, given: Any, registered: int) -> int:

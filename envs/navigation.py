@@ -39,7 +39,7 @@ def find_task(
     return task.with_settings(**settings, max_episode_steps=limit)
 
 
-def _spaces(task: NavigationTask) -> tuple[Box, Box]:
+def _spaces(task: NavigationTask) -> tuple[Any, Any]:
     """Space of one flat observation (lidars in [0, 1], magnetometer in [-0.5, 0.5]), and action."""
     layout = task.observation_layout
     high = np.full(max(block.stop for block in layout.values()), np.inf)
@@ -70,6 +70,11 @@ class _TaskAttributes:
     def observation_layout(self) -> dict[str, slice]:
         """Sensor block -> slice of the observation, in order."""
         return self.task.observation_layout
+
+    @property
+    def setting_names(self) -> list[str]:
+        """The keyword arguments that change the task."""
+        return self.task.setting_names
 
     @property
     def task_version(self) -> int:
