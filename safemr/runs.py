@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-import inspect
 import json
 import math
 import pkgutil
@@ -138,27 +137,20 @@ def _inspected(name: str, settings_json: str) -> tuple[int, Traits]:
     """Version and traits of a registered task with these settings."""
     gymnasium = importlib.import_module("gymnasium")
     settings = json.loads(settings_json)
-    try:
-        environment = gymnasium.make(f"{name}-v0", disable_env_checker=True, **settings)
+    known = gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped.setting_names
+    for setting in settings:  # before Gymnasium sees them: it has keywords of its own, as `task`
+        if setting not in known:
+            raise unknown("setting", setting, known, f"task {name}")
+    try:  # a batch, since that is what learners train on
+        environment = gymnasium.make_vec(
+            f"{name}-v0", vectorization_mode="vector_entry_point", **settings
+        )
     except Exception as error:  # the environment's own validation, whatever its type
-        known = _setting_names(name)
-        for setting in settings:
-            if known and setting not in known:
-                raise unknown("setting", setting, known, f"task {name}") from error
-        reason = str(error).partition(" was raised from the environment creator")[0]
-        raise UserError(f"task {name}: {reason.partition(chr(10))[0]}") from error
+        reason = str(error).partition(chr(10))[0].removeprefix(f"{name}: ")
+        raise UserError(f"task {name}: {reason}") from error
     found = int(environment.unwrapped.task_version), traits(environment.unwrapped)
     environment.close()
     return found
-
-
-def _setting_names(name: str) -> list[str]:
-    gymnasium = importlib.import_module("gymnasium")
-    constructor = type(gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped).__init__
-    parameters = list(inspect.signature(constructor).parameters.values())[1:]
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return []
-    return [p.name for p in parameters]
 
 
 def describe_task(
