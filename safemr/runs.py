@@ -7,22 +7,21 @@ numbers changes the digest, and with it the folder of the record.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib
 import json
 import math
-import pkgutil
-import types
-import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from safemr import records, reference
-from safemr.config import FAMILIES, Config, Variant, unknown
+from safemr.catalogue import Algorithm, hyperparameters, load_algorithm
+from safemr.catalogue import algorithm_names as algorithm_names
+from safemr.config import Config, Variant, unknown
 from safemr.errors import UserError
+from safemr.hyperparameters import Setting
 from safemr.strict_yaml import show
 from safemr.tasks import Described, Traits, base_of, name_of, settings_of, task_settings, traits
 from safemr.tasks import Task as TaskOrName
@@ -79,43 +78,6 @@ class Plan:
     def runs(self) -> tuple[Run, ...]:
         """Every run, the outside ones last."""
         return (*self.trained, *self.outside)
-
-
-@dataclass(frozen=True)
-class Algorithm:
-    """What a module of `safemr.algorithms` says about itself."""
-
-    name: str
-    version: int
-    family: str
-    hyperparameters: type[Any]  # the frozen dataclass ``Config``
-    trainer: type[Any]
-
-
-def algorithm_names() -> list[str]:
-    """The modules in `safemr.algorithms`: one file is one algorithm."""
-    package = importlib.import_module("safemr.algorithms")
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
-
-
-@functools.cache
-def load_algorithm(name: str, where: str = "") -> Algorithm:
-    """Import an algorithm by name and check the module's contract."""
-    if name not in algorithm_names():
-        raise unknown("algorithm", name, algorithm_names(), where)
-    file = f"safemr/algorithms/{name}.py"
-    try:
-        module = importlib.import_module(f"safemr.algorithms.{name}")
-    except Exception as error:  # whatever is wrong in that file, its author wants to know where
-        reason = str(error).partition("\n")[0]
-        raise UserError(f"{file} does not import: {type(error).__name__}: {reason}") from error
-    for part in ("VERSION", "Config", "Trainer"):
-        if not hasattr(module, part):
-            raise UserError(f"{file} must define {part}")
-    family = getattr(module.Trainer, "family", None)
-    if family not in FAMILIES:
-        raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
-    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer)
 
 
 @functools.cache
@@ -200,53 +162,22 @@ def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
         )
 
 
-def hyperparameters(
-    algorithm: Algorithm, overrides: Mapping[str, Any], where: str
-) -> dict[str, Any]:
-    """The complete hyperparameters of an algorithm, defaults included, types and ranges checked."""
-    hints = typing.get_type_hints(algorithm.hyperparameters)
-    names = {field.name for field in dataclasses.fields(algorithm.hyperparameters) if field.init}
-    values = {}
-    for name, value in overrides.items():
-        if name not in names:
-            raise unknown("hyperparameter", name, names, f"{where} ({algorithm.name})")
-        values[name] = coerce(value, hints[name], f"{where}: {name}")
+def check_setting(
+    algorithm: Algorithm, values: Mapping[str, Any], task: Mapping[str, Any], steps: int, where: str
+) -> None:
+    """Refuse hyperparameters that cannot work on a task, as `describe_task` gives it, in a budget.
+
+    Raises:
+        UserError: it names the hyperparameter, and what it may be there.
+    """
+    check = getattr(algorithm.hyperparameters(**values), "check_setting", None)
+    if check is None:  # an algorithm that does without `safemr.hyperparameters`
+        return
     try:
-        complete = algorithm.hyperparameters(**values)
-    except (UserError, ValueError) as error:
-        raise UserError(f"{where}: {error}") from error
-    return dataclasses.asdict(complete)
-
-
-def coerce(value: Any, hint: Any, where: str) -> Any:
-    """``value`` as the annotated type, or a UserError. Integers pass as floats, nothing else."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if hint is Any:
-        return value
-    if origin is typing.Literal:
-        if not any(value == choice and type(value) is type(choice) for choice in arguments):
-            raise unknown("value", value, map(str, arguments), where)
-        return value
-    if origin in (typing.Union, types.UnionType):
-        for option in arguments:
-            try:
-                return coerce(value, option, where)
-            except UserError:
-                continue
-    elif origin in (tuple, list) and isinstance(value, (list, tuple)):
-        variadic = origin is list or arguments[-1:] == (Ellipsis,)
-        types_of = [arguments[0]] * len(value) if variadic else list(arguments)
-        if len(types_of) == len(value):
-            return origin(coerce(v, t, where) for v, t in zip(value, types_of, strict=True))
-    elif hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if abs(value) < math.inf and abs(value) < 1e300:
-            return float(value)
-    elif (hint is None or hint is type(None)) and value is None:
-        return None
-    elif hint in (int, str, bool) and type(value) is hint:
-        return value
-    name = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
-    raise UserError(f"{where} must be {name}, not {show(value)}")
+        has = described(task).traits
+        check(Setting(has.action_dim, has.episode_steps or steps, steps))
+    except UserError as error:
+        raise UserError(f"{where} on {task['name']}: {error}") from error
 
 
 def make_run(
@@ -363,10 +294,10 @@ class _Resolver:
             self._task(task, "task_overrides")
             for family, values in overrides.hyperparameters.items():
                 names = {
-                    field.name
+                    name
                     for algorithm in algorithms
                     if algorithm.family == family
-                    for field in dataclasses.fields(algorithm.hyperparameters)
+                    for name in algorithm.settable
                 }
                 for name in values.keys() - names:
                     where = f"task_overrides.{task}.hyperparameters.{family}"
@@ -385,11 +316,12 @@ class _Resolver:
         for label, variant in variants.items():
             algorithm = load_algorithm(variant.algorithm)
             shared = overrides.hyperparameters.get(algorithm.family, {}) if overrides else {}
-            names = {field.name for field in dataclasses.fields(algorithm.hyperparameters)}
+            names = algorithm.settable
             # What makes the variant what it is stands above what tunes a family to a task.
             chosen = {k: v for k, v in shared.items() if k in names} | dict(variant.overrides)
             values = hyperparameters(algorithm, chosen, f"{section}.{label}")
             steps = self._steps(task, algorithm.family)
+            check_setting(algorithm, values, described, steps, f"{section}.{label}")
             for seed in seeds:
                 yield make_run(
                     described,

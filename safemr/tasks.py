@@ -9,6 +9,7 @@ here; whether a drawing, a check or a controller makes sense for a task, its `Tr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -29,6 +30,7 @@ class Traits:
 
     point_robot: bool  # of which `safemr.point_robot` is a model; its scenes can be drawn
     pushes_box: bool
+    action_dim: int
     episode_steps: int | None  # the most steps of an episode, where the environment says so
 
 
@@ -83,7 +85,11 @@ def traits(environment: Any) -> Traits:
     return Traits(
         point_robot="velocimeter" in getattr(environment, "observation_layout", ()),
         pushes_box=bool(getattr(task, "has_box", False)),
+        action_dim=math.prod(_action_space(environment).shape),
         episode_steps=getattr(environment, "max_episode_steps", None),
     )
 
 
+def _action_space(environment: Any) -> Any:
+    """That of one environment, also where there is a batch."""
+    return getattr(environment, "single_action_space", environment.action_space)

@@ -68,13 +68,14 @@ def train(
     """Trains inside an open ``session``, continuing from its checkpoint where there is one.
 
     Raises UserError where the installed code is not the version that ``config`` asks for, and
-    `safemr.training.TrainingDivergedError` when a quantity stops being finite.
+    `safemr.training.TrainingDivergedError` when a quantity stops being finite or
+    becomes absurdly large.
     """
     import torch
 
     from safemr.evaluate import evaluate
     from safemr.mirror import Mirror
-    from safemr.training import check_finite
+    from safemr.training import check_parameters
 
     # One run is one thread: at these sizes more threads only wait for each other.
     torch.set_num_threads(1)
@@ -101,8 +102,7 @@ def train(
             begun, before = time.perf_counter(), trainer.step
             metrics = trainer.advance(min((before // log_every + 1) * log_every, steps))
             trained = time.perf_counter()
-            parameters = trainer.policy.network.parameters.detach()
-            check_finite(trainer.step, {"policy_parameters": float(parameters.sum())})
+            check_parameters(trainer.step, trainer.policy.network.parameters)
             if trainer.step // evaluation["every"] > before // evaluation["every"]:
                 result = evaluate(trainer.policy, evaluation_envs, evaluation["seed"])
                 metrics |= {f"eval_{name}": value for name, value in result.items()}
@@ -179,10 +179,13 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     task = _task(arguments, settings)
     algorithm = runs.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
+    task = runs.describe_task(arguments.task, settings, "--task")
+    values = runs.hyperparameters(algorithm, overrides, "--set")
+    runs.check_setting(algorithm, values, task, arguments.steps, arguments.algorithm)
     run = runs.make_run(
         task,
         algorithm,
-        runs.hyperparameters(algorithm, overrides, "--set"),
+        values,
         variant=arguments.variant or arguments.algorithm,
         seed=arguments.seed,
         steps=arguments.steps,

@@ -24,8 +24,8 @@ DEFAULT = ROOT / "config/config.yaml"
 VALID: dict[str, Any] = {
     "tasks": ["Pillars-0.15-Goal", "Hazards-0.15-Push"],
     "algorithms": {
-        "SafeMR": {"algorithm": "safemr", "a": 0.35, "b": 0.15},
-        "PPO-L": {"algorithm": "ppo_lagrangian"},
+        "SafeMR": {"algorithm": "safemr", "a": 0.35, "b": 0.15, "start_steps": 100},
+        "PPO-L": {"algorithm": "ppo_lagrangian", "epoch_steps": 800},
     },
     "seeds": [100, 101],
     "budget": {"off_policy": 1000, "on_policy": 2000},
@@ -45,7 +45,12 @@ VALID: dict[str, Any] = {
         "points": [[0.35, 0.15], [0.45, 0.15]],
         "seeds": [100],
     },
-    "aircraft": {"algorithms": {"JointSIS": {"algorithm": "joint_sis"}}, "seeds": [100]},
+    "aircraft": {
+        "algorithms": {
+            "JointSIS": {"algorithm": "joint_sis", "start_steps": 100, "target_entropy": -1.0}
+        },
+        "seeds": [100],
+    },
     "outside": {"Script": {"algorithm": "script", "steps": 100, "hyperparameters": {"gain": 1.0}}},
     "results_root": "results",
     "figures_root": "paper_figures",
@@ -107,7 +112,10 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
         {"X": {"algoritm": "fac"}},
         *({"X": {"algorithm": name}} for name in [*NOT_A_NAME, "FAC", "safe_mr", "os", "__init__"]),
         {"A": {"algorithm": "fac"}, "a": {"algorithm": "joint_sis"}},
-        {"A": {"algorithm": "fac"}, "B": {"algorithm": "fac", "n": 2.0}},
+        {
+            "A": {"algorithm": "fac", "start_steps": 100},
+            "B": {"algorithm": "fac", "n": 2.0, "start_steps": 100},
+        },
     ],
     ("algorithms", "SafeMR"): [
         *({"algorithm": "safemr", "gamma": value} for value in [*NOT_A_NUMBER, math.inf, 2, -0.1]),
