@@ -20,9 +20,10 @@ from typing import Any
 from safemr import records
 from safemr.catalogue import Algorithm, hyperparameters, load_algorithm
 from safemr.catalogue import algorithm_names as algorithm_names
-from safemr.config import Config, Variant, unknown
+from safemr.config import Config, Variant
 from safemr.errors import UserError
 from safemr.hyperparameters import Setting
+from safemr.names import unknown
 
 _ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
 
