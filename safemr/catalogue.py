@@ -14,9 +14,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from safemr.config import FAMILIES, unknown
+from safemr.config import FAMILIES
 from safemr.errors import UserError
 from safemr.hyperparameters import unused
+from safemr.names import unknown
 from safemr.strict_yaml import show
 
 

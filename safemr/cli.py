@@ -14,8 +14,8 @@ import importlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
-from safemr.config import unknown
 from safemr.errors import UserError
+from safemr.names import unknown
 
 # Command -> module with main(arguments) -> exit status, imported only when it is called.
 COMMANDS = {

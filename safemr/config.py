@@ -10,13 +10,14 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
 from safemr.errors import UserError
+from safemr.names import unknown
 from safemr.strict_yaml import read_yaml, show, typed
 
 FAMILIES = ("off_policy", "on_policy")
@@ -24,8 +25,12 @@ WANDB_MODES = ("disabled", "offline", "online")
 LARGEST_SEED = 2**31 - 1
 LARGEST_COUNT = 10**10
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
-_ROOT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
-_SOURCES = {"benchmarks", "config", "docs", "envs", "profiles", "safemr", "tests", "workflow"}
+_ROOT = re.compile(r"(/|(\.\./)*)[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+_REPOSITORY = Path(__file__).resolve().parents[1]
+_SOURCES = {
+    *("benchmarks", "config", "docs", "envs", "examples", "profiles", "safemr", "tests"),
+    "workflow",
+}
 
 
 @dataclass(frozen=True)
@@ -204,15 +209,6 @@ def parse(raw: Any) -> Config:
     if config.sensitivity and config.sensitivity.variant not in config.algorithms:
         raise unknown("sensitivity.algorithm", config.sensitivity.variant, config.algorithms)
     return config
-
-
-def unknown(kind: str, name: Any, known: Iterable[str], where: str = "") -> UserError:
-    """The error for a name that does not exist, with the nearest one that does."""
-    names = sorted(known)
-    close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
-    listing = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-    remedy = f"did you mean {close[0]!r}?" if close else f"there is {listing or 'none'}"
-    return UserError(f"unknown {kind} {show(name)}{' in ' + where if where else ''}; {remedy}")
 
 
 _TOP_LEVEL = (
@@ -451,14 +447,24 @@ def _outside(value: Any, where: str) -> Outside:
 def _root(value: Any, where: str) -> Path:
     if not isinstance(value, str) or not _ROOT.fullmatch(value):
         raise UserError(
-            f"{where} must be a relative path of plain names (no '..', no hidden folder), "
-            f"not {show(value)}"
+            f"{where} must be a path of plain names, from here, from above (../) or from / "
+            f"(no hidden folder, no '..' but at the start), not {show(value)}"
         )
-    if Path(value).parts[0] in _SOURCES:
+    path = Path(value)
+    place = path.resolve()
+    if path.parts[0] in _SOURCES or _among_sources(place):
         raise UserError(f"{where} = {value!r} lies among the sources; choose another folder")
-    if Path(value).exists() and not Path(value).is_dir():
+    if place in (_REPOSITORY, *_REPOSITORY.parents, Path.cwd(), *Path.cwd().parents):
+        raise UserError(f"{where} = {value!r} contains the repository; choose a folder beside it")
+    if path.exists() and not path.is_dir():
         raise UserError(f"{where} = {value!r} is a file; choose a folder")
-    return Path(value)
+    return path
+
+
+def _among_sources(place: Path) -> bool:
+    inside = place.is_relative_to(_REPOSITORY)
+    first = place.relative_to(_REPOSITORY).parts[:1] if inside else ()
+    return any(name in _SOURCES or name.startswith(".") for name in first)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -19,9 +19,10 @@ from typing import Any
 from safemr import records, reference
 from safemr.catalogue import Algorithm, hyperparameters, load_algorithm
 from safemr.catalogue import algorithm_names as algorithm_names
-from safemr.config import Config, Variant, unknown
+from safemr.config import Config, Variant
 from safemr.errors import UserError
 from safemr.hyperparameters import Setting
+from safemr.names import unknown
 from safemr.strict_yaml import show
 from safemr.tasks import Described, Traits, base_of, name_of, settings_of, task_settings, traits
 from safemr.tasks import Task as TaskOrName

@@ -332,7 +332,8 @@ def test_two_snakemakes_at_once_train_every_run_once(checkout: Checkout) -> None
 @pytest.mark.slow
 def test_a_diverging_run_stops_alone(checkout: Checkout) -> None:
     """The rest of the grid goes on, the failure is not tried again, and the summary names it."""
-    diverging = {"algorithm": "safemr", "policy_lr": 1.0e30, "start_steps": 200}
+    diverging = {"algorithm": "safemr", "target_entropy": 1.386, "temperature_lr": 1.0}
+    diverging["start_steps"] = 200
     checkout.configure(seeds=[100], algorithms={"Lost": diverging, **GRID["algorithms"]})
     printed = checkout.snakemake("all", "--keep-going", check=False)
     recorded = {run.variant for run in checkout.plan().runs

@@ -49,7 +49,7 @@ class Config(fac.Config):
     constraint_scale: float = 1.0  # a discounted cost is of the size of a discounted reward
     multiplier_bias: float = 0.0  # softplus(0) = 0.69: felt from the start, as in PPO-Lagrangian
 
-    RANGES: ClassVar[Mapping[str, str]] = {"cost_rate_limit": "[0, inf)"}
+    RANGES: ClassVar[Mapping[str, str]] = {"cost_rate_limit": "[0, 100]"}
     UNUSED: ClassVar[Mapping[str, str]] = dict.fromkeys(
         ENERGY_FIELDS, "there is no energy function"
     )
