@@ -35,20 +35,26 @@ from safemr.locks import ProcessLock
 
 CHECKPOINT, ATTEMPTS, LOCK = "checkpoint.pt", "attempts.jsonl", "lock"
 SHARE = 0.02  # the largest share of the run time that checkpoints may take
-_ARRAY = "ndarray"  # the key that marks an encoded NumPy array
+# Of checkpoint files: those before 2 did not keep the order of arrays in memory.
+FORMAT, _FORMAT_KEY = 2, "format"
+_ARRAY = "numpy.ndarray"  # the key that marks an encoded NumPy array
 
 
 def encode(value: Any, where: str = "state") -> Any:
     """Nested containers of arrays and plain values as what ``torch.load(weights_only=True)`` reads.
 
-    NumPy arrays become tensors that share their memory, under a marking key; tensors that show a
-    part of a larger memory are copied, because torch saves the memory and not the part.
+    NumPy arrays become tensors that share their memory, under a marking key. The order of an array
+    or tensor in memory is part of the state, because products round differently in another order:
+    strides are kept. What shows a part of a larger memory is copied, densely and in the order of
+    its axes, because torch saves the memory and not the part.
 
     Raises:
         TypeError: naming the entry that is neither an array nor a plain value.
     """
     if isinstance(value, np.ndarray):
-        return {_ARRAY: torch.from_numpy(np.ascontiguousarray(value)), "shape": list(value.shape)}
+        if any(stride < 0 or stride % value.itemsize for stride in value.strides):
+            value = np.array(value)  # torch has no such strides
+        return {_ARRAY: _dense(torch.from_numpy(value))}
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):
@@ -57,17 +63,23 @@ def encode(value: Any, where: str = "state") -> Any:
         items = (encode(item, f"{where}[{index}]") for index, item in enumerate(value))
         return type(value)(items)
     if isinstance(value, torch.Tensor):
-        return value if value.untyped_storage().nbytes() == value.nbytes else value.clone()
+        return _dense(value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"{where} is a {type(value).__name__}, which a checkpoint cannot hold")
 
 
+def _dense(tensor: torch.Tensor) -> torch.Tensor:
+    """The tensor, or a copy that keeps its axes' order, where its memory holds more than it."""
+    whole = tensor.untyped_storage().nbytes() == tensor.nbytes
+    return tensor if whole else tensor.clone(memory_format=torch.preserve_format)
+
+
 def decode(value: Any) -> Any:
     """The inverse of `encode`."""
     if isinstance(value, dict):
-        if value.keys() == {_ARRAY, "shape"}:
-            return value[_ARRAY].numpy().reshape(value["shape"])
+        if value.keys() == {_ARRAY}:
+            return value[_ARRAY].numpy()
         return {key: decode(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return type(value)(decode(item) for item in value)
@@ -77,7 +89,7 @@ def decode(value: Any) -> Any:
 def save(path: Path, content: Mapping[str, Any]) -> None:
     """Write a checkpoint as a whole and durably; after a failure the previous one is untouched."""
     with atomic.replacing(path) as stream:
-        torch.save(encode(content), stream)
+        torch.save({_FORMAT_KEY: FORMAT, **encode(content)}, stream)
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -89,6 +101,8 @@ def load(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} is not a readable checkpoint: {reason}") from error
     if not isinstance(content, dict):
         raise UserError(f"{path} is not a checkpoint of a run")
+    if content.pop(_FORMAT_KEY, 1) != FORMAT:
+        raise UserError(f"{path} was written by another version of this program")
     return content
 
 
