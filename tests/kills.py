@@ -44,7 +44,7 @@ class TooLateError(Exception):
 # run learns from early on, an on-policy run has twelve epochs. -> hyperparameters, steps.
 SHORT: dict[str, tuple[dict[str, Any], int]] = {
     "off_policy": ({"start_steps": 480}, 3_840),
-    "on_policy": ({"epoch_steps": 2_000}, 24_000),
+    "on_policy": ({"epoch_steps": 1_000}, 12_000),
 }
 SETTINGS = {"Hazards-0.15-Push": {"max_episode_steps": 50}}
 LOG_POINTS = 12  # in each of them
@@ -53,10 +53,10 @@ LOG_POINTS = 12  # in each of them
 def short_run(
     name: str, task: str = "Pillars-0.15-Goal", overrides: dict[str, Any] | None = None
 ) -> runs.Run:
-    """A run of an algorithm with its default networks, ``overrides`` apart; evaluated six times."""
+    """A run of an algorithm with its default networks, ``overrides`` apart."""
     algorithm = runs.load_algorithm(name)
     short, steps = SHORT[algorithm.family]
-    return make_run(name, task, {**short, **(overrides or {})}, steps, LOG_POINTS, LOG_POINTS // 2)
+    return make_run(name, task, {**short, **(overrides or {})}, steps, LOG_POINTS, LOG_POINTS // 4)
 
 
 def make_run(
