@@ -298,7 +298,7 @@ class OnPolicyTrainer(ABC):
             "critic_optimizer": copy.deepcopy(self.critic_optimizer.state_dict()),
             "noise": self.noise.get_state(),
             "order": self.order.get_state(),
-            "observations": torch.from_numpy(np.array(self.observations)),
+            "observations": self.observations,
             "statistics": self.statistics.state_dict(),
             "envs": self.envs.get_state(),
         }
@@ -310,6 +310,6 @@ class OnPolicyTrainer(ABC):
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.noise.set_state(state["noise"])
         self.order.set_state(state["order"])
-        self.observations = state["observations"].numpy().copy()
+        self.observations = np.array(state["observations"])  # in the same order in memory
         self.statistics.load_state_dict(state["statistics"])
         self.envs.set_state(state["envs"])

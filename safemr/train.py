@@ -15,15 +15,18 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from safemr import records, runs
-from safemr.checkpoints import CHECKPOINT, RunSession
 from safemr.config import WANDB_MODES, task_name
 from safemr.conventions import EVALUATION_SEED
 from safemr.errors import UserError, tell
+from safemr.signals import StoppedError, StopSignals
 from safemr.strict_yaml import assignment
 from safemr.tasks import make_envs
+
+if TYPE_CHECKING:
+    from safemr.checkpoints import RunSession
 
 
 class Progress:
@@ -210,40 +213,19 @@ def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
     return runs.describe_task(name, settings, "--task-name", base=arguments.task)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status (2 user error, 3 locked, 4 diverged)."""
-    from safemr.training import TrainingDivergedError
-
+def main(argv: Sequence[str] | None = None, signals: StopSignals | None = None) -> int:
+    """Runs the command line; returns the exit status (2 user error, 3 locked, 4 diverged, 128 and
+    the number of the signal that ended it). ``signals``: handlers that outlive this call."""
+    if signals is None:
+        with StopSignals() as own:
+            return main(argv, own)
     arguments = _parse(argv)
     try:
-        config, variant = resolve(arguments)
-        label = f"{variant} {config['task']['name']} seed {config['seed']}"
-        with RunSession(
-            config,
-            variant,
-            arguments.root,
-            wait=arguments.wait,
-            die_with_parent=arguments.die_with_parent,
-        ) as session:
-            if session.complete:
-                tell(f"{label}: already recorded in {session.folder}")
-                return 0
-            try:
-                train(
-                    config,
-                    session,
-                    label=label,
-                    wandb={"mode": arguments.wandb, "project": arguments.wandb_project},
-                )
-            except TrainingDivergedError as error:
-                session.fail(str(error))
-                last = int(session.rows[-1]["step"]) if session.rows else 0
-                path = session.work / CHECKPOINT
-                kept = f"last good checkpoint: {path}" if path.exists() else "no checkpoint yet"
-                tell(f"error: {label}: {error}; last good log point: step {last}; {kept}")
-                return 4
-            tell(f"{label}: record in {session.folder}")
-            return 0
+        return _run(arguments, signals)
+    except StoppedError as error:
+        name = error.number.name
+        tell(f"stopped at once by {name}; the same command continues from the last checkpoint")
+        return 128 + error.number
     except UserError as error:
         tell(f"error: {error}")
         return int(getattr(error, "exit_code", 2))
@@ -252,5 +234,42 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
+def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    # They import torch, which takes seconds, in which a signal shall not end in a traceback.
+    from safemr.checkpoints import CHECKPOINT, RunSession
+    from safemr.training import TrainingDivergedError
+
+    config, variant = resolve(arguments)
+    label = f"{variant} {config['task']['name']} seed {config['seed']}"
+    with RunSession(
+        config,
+        variant,
+        arguments.root,
+        wait=arguments.wait,
+        die_with_parent=arguments.die_with_parent,
+        signals=signals,
+    ) as session:
+        if session.complete:
+            tell(f"{label}: already recorded in {session.folder}")
+            return 0
+        try:
+            train(
+                config,
+                session,
+                label=label,
+                wandb={"mode": arguments.wandb, "project": arguments.wandb_project},
+            )
+        except TrainingDivergedError as error:
+            session.fail(str(error))
+            last = int(session.rows[-1]["step"]) if session.rows else 0
+            path = session.work / CHECKPOINT
+            kept = f"last good checkpoint: {path}" if path.exists() else "no checkpoint yet"
+            tell(f"error: {label}: {error}; last good log point: step {last}; {kept}")
+            return 4
+        tell(f"{label}: record in {session.folder}")
+        return 0
+
+
 if __name__ == "__main__":
-    raise SystemExit(main())
+    # Until the process has ended: a late signal would make Snakemake remove the finished record.
+    raise SystemExit(main(signals=StopSignals().install()))
