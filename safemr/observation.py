@@ -45,8 +45,8 @@ class ObservationTransform:
     """Selects, scales and clips observation columns.
 
     columns [dim] int64, scale [dim] and clip [dim] float32. Calling it maps [N, obs] (any float
-    type) to float32 [N, dim]. width is the raw observations' number of columns, which a saved
-    policy does not say.
+    type, any order in memory) to float32 [N, dim] in Fortran order. width is the raw observations'
+    number of columns, which a saved policy does not say.
     """
 
     def __init__(
@@ -95,6 +95,10 @@ class ObservationTransform:
             )
 
     def __call__(self, observations: NDArray[np.floating]) -> NDArray[np.float32]:
+        # Here the arithmetic of networks begins, in training and evaluation, so here its operands'
+        # type and order in memory are decided: float32, one column after another, which is what
+        # NumPy makes of an index array behind an ellipsis. In another order products round
+        # otherwise on some processors, and recorded runs would not be repeated.
         out = observations[..., self.columns].astype(np.float32)
         out *= self.scale
         if len(self._clipped):

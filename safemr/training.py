@@ -58,7 +58,10 @@ class Trainer(Protocol):
         """Everything needed to continue bit for bit: tensors, arrays and plain types only."""
         ...
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Takes over a `state_dict`, of arrays also the order in memory (``np.array(x)`` keeps it,
+        ``x.copy()`` does not): products with them must round as before."""
+        ...
 
 
 def check_finite(step: int, metrics: Mapping[str, float], allowed: tuple[str, ...] = ()) -> None:
