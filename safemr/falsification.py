@@ -115,7 +115,7 @@ class Falsification:
         """The worst state as plain numbers, enough for `replay`."""
         state = dict(zip(COLUMNS, map(float, self.worst_state), strict=True))
         name, base, changed = name_of(self.task), base_of(self.task), settings_of(self.task)
-        task = {"task": name, **({"base": base} if base != name else {})}
+        task: dict[str, Any] = {"task": name, **({"base": base} if base != name else {})}
         if task_settings(changed):
             task["settings"] = task_settings(changed)
         return {**task, **self.zeta._asdict(), "eta": self.eta, "state": state,
@@ -123,14 +123,20 @@ class Falsification:
 
 
 def falsify(
-    envs: Any, zeta: Zeta, *, eta: float = 0.0, count: int = 2**16, seed: int = 0, rounds: int = 12,
+    envs: Any,
+    zeta: Zeta,
+    *,
+    eta: float = 0.0,
+    count: int = 2**16,
+    seed: int = 0,
+    rounds: int = 12,
     task: Task | None = None,
 ) -> Falsification:
     """Search `count` Sobol states, refine the worst, confirm in the simulator.
 
-    envs: `make_simulator` of the task, by default the registered one. Each round of the refinement perturbs the worst states, with
-    smaller steps than the last, and keeps what is worse. Raises UserError where phi stays positive
-    far from the obstacle, so that the box of states has no end.
+    envs: `make_simulator` of the task, by default the registered one. Each round of the refinement
+    perturbs the worst states, with smaller steps than the last, and keeps what is worse. Raises
+    UserError where phi stays positive far from the obstacle, so that the box of states has no end.
     """
     from scipy.stats import qmc  # a second, which kept measurements do not need
 
@@ -164,8 +170,9 @@ def falsify(
     agree = (simulated >= 0) == (least(examined) >= 0)
     top = int(simulated.argmax())
     return Falsification(
-        task=task or envs.task.name, zeta=zeta, eta=eta, states=states, phi=energies(states, d_min, zeta),
-        margin=margin, worst_state=examined[top], worst_margin=float(simulated[top]),
+        task=task or envs.task.name, zeta=zeta, eta=eta,
+        states=states, phi=energies(states, d_min, zeta), margin=margin,
+        worst_state=examined[top], worst_margin=float(simulated[top]),
         confirmed=int(agree.sum()), examined=len(examined),
     )  # fmt: skip
 

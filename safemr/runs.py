@@ -441,7 +441,10 @@ class _Resolver:
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
         """The entry of a task by its name in the configuration."""
-        overrides, variant = self.config.task_overrides.get(name), self.config.task_variants.get(name)
+        overrides, variant = (
+            self.config.task_overrides.get(name),
+            self.config.task_variants.get(name),
+        )
         given = dict(overrides.settings) if overrides else {}
         if variant is None:
             if name not in task_names():

@@ -48,7 +48,8 @@ def test_highest_return_follows_the_interval_of_the_difference(scores, shift, ex
 
 
 def test_the_methods_certificates_are_its_own_and_those_of_its_points():
-    row = {"task": TASK, "infeasible_share": 0.0, "margin_inside_aligned": 1.0, "margin_outside_aligned": 1.0,
+    row = {"task": TASK, "infeasible_share": 0.0,
+           "margin_inside_aligned": 1.0, "margin_outside_aligned": 1.0,
            "margin_inside_drag": -1.0, "margin_outside_drag": -1.0}  # fmt: skip
     elsewhere = {**row, "certificate": "SafeMR (seed 0)", "worst_margin": 0.5, "task": "Pillars-8"}
     names = {"SafeMR (seed 0)": -0.1, "SafeMR[0.45,0.15] (seed 0)": -0.2,
@@ -166,7 +167,8 @@ def test_aircraft_claims(scores, volumes, missed, expected):
     [(0.02, 1.0, "refuted"), (-0.01, 1.0, "confirmed"), (-0.01, -1.0, "inconclusive")],
 )
 def test_one_state_without_a_safe_action_refutes_feasibility(scores, worst, aligned, expected):
-    row = {"task": TASK, "certificate": "paper [0.35, 0.15]", "worst_margin": worst, "infeasible_share": 0.0,
+    row = {"task": TASK, "certificate": "paper [0.35, 0.15]",
+           "worst_margin": worst, "infeasible_share": 0.0,
            "margin_inside_aligned": aligned, "margin_outside_aligned": aligned,
            "margin_inside_drag": -1.0, "margin_outside_drag": -1.0}  # fmt: skip
     given = evidence(scores, certificates=pd.DataFrame([row]))

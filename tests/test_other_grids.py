@@ -1,5 +1,5 @@
 """Grids other than the paper's: every registered task, alone and together, and tasks with settings
-of their own go through all that draws and tabulates, and nothing of the paper stands beside them."""
+of their own go through all that draws and tabulates; nothing of the paper stands beside them."""
 
 from __future__ import annotations
 
@@ -107,10 +107,9 @@ def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> Non
 def test_the_picture_of_the_tasks_shows_what_their_settings_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entries = [
-        *({"name": name, "version": 1, "settings": {}} for name in (*reference.TASKS, "PointGoal1")),
-        {"name": "Pillars-8", "version": 1, **EIGHT},
-    ]  # fmt: skip
+    registered = (*reference.TASKS, "PointGoal1")
+    entries: list[dict[str, Any]] = [{"name": name, "settings": {}} for name in registered]
+    entries.append({"name": "Pillars-8", **EIGHT})
     seen = {}
     draw = scenes.environments
 
@@ -121,7 +120,8 @@ def test_the_picture_of_the_tasks_shows_what_their_settings_say(
     monkeypatch.setattr(scenes, "environments", spy)
     run_script("illustrations", params={"tasks": entries},
                output={"pdf": [str(tmp_path / "environments.pdf")]})  # fmt: skip
-    assert seen == dict(zip([*reference.TASKS, "PointGoal1", "Pillars-8"], (4, 4, 1, 1, 8, 8), strict=True))
+    counts = (4, 4, 1, 1, 8, 8)
+    assert seen == dict(zip((*registered, "Pillars-8"), counts, strict=True))
     assert {path.name for path in tmp_path.iterdir()} == {"environments.pdf", "environments.png"}
 
 

@@ -38,9 +38,7 @@ def test_mean_interval_is_the_one_sample_t_interval():
 def test_mean_interval_of_three_runs_by_hand():
     # t(2) at a two-sided level L is L sqrt(2 / (1 - L^2)); s = 1
     estimate = statistics.mean_interval(np.array([1.0, 2.0, 3.0]))
-    assert estimate.half_width == pytest.approx(
-        0.95 * np.sqrt(2 / (1 - 0.95**2)) / np.sqrt(3)
-    )
+    assert estimate.half_width == pytest.approx(0.95 * np.sqrt(2 / (1 - 0.95**2)) / np.sqrt(3))
 
 
 def test_an_interval_ends_at_the_bounds_of_its_quantity():
@@ -65,7 +63,9 @@ def test_tables_and_curves_use_the_bounds(metric):
     scores = progress.drop(columns="step")
     for table in (statistics.summarise(scores), statistics.learning_curves(progress, metric)):
         assert table["low"].iloc[0] == 0
-        assert table["high"].iloc[0] == (1.0 if "share" in metric else pytest.approx(1.768, abs=1e-3))
+        assert table["high"].iloc[0] == (
+            1.0 if "share" in metric else pytest.approx(1.768, abs=1e-3)
+        )
 
 
 def test_equal_runs_have_exactly_no_width_whatever_the_rounding_of_their_mean():

@@ -246,7 +246,8 @@ def test_nothing_of_the_paper_stands_beside_a_task_that_it_did_not_run(scores):
 
 def test_two_seeds_leave_out_the_half_width_rather_than_call_it_missing():
     learned = pd.DataFrame(
-        [(TASK, "SafeMR", seed, name, 1.0 + seed) for seed in (0, 1) for name in ("sigma", "k", "n")],
+        [(TASK, "SafeMR", seed, name, 1.0 + seed)
+         for seed in (0, 1) for name in ("sigma", "k", "n")],
         columns=["task", "variant", "seed", "metric", "value"],
     )  # fmt: skip
     table = sensitivity.table_two(learned, {"SafeMR": reference.HEADLINE})
