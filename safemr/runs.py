@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,16 @@ from safemr.errors import UserError
 from safemr.hyperparameters import Setting
 from safemr.names import unknown
 from safemr.strict_yaml import show
-from safemr.tasks import Described, Traits, base_of, name_of, settings_of, task_settings, traits
+from safemr.tasks import (
+    Described,
+    Traits,
+    base_of,
+    make_envs,
+    name_of,
+    settings_of,
+    task_settings,
+    traits,
+)
 from safemr.tasks import Task as TaskOrName
 
 _ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
@@ -96,8 +104,7 @@ def task_names() -> list[str]:
 
 
 @functools.cache
-def _inspected(name: str, settings_json: str) -> tuple[int, Traits]:
-    """Version and traits of a registered task with these settings."""
+def _task_version(name: str, settings_json: str) -> int:
     gymnasium = importlib.import_module("gymnasium")
     settings = json.loads(settings_json)
     known = gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped.setting_names
@@ -111,9 +118,9 @@ def _inspected(name: str, settings_json: str) -> tuple[int, Traits]:
     except Exception as error:  # the environment's own validation, whatever its type
         reason = str(error).partition(chr(10))[0].removeprefix(f"{name}: ")
         raise UserError(f"task {name}: {reason}") from error
-    found = int(environment.unwrapped.task_version), traits(environment.unwrapped)
+    version = int(environment.unwrapped.task_version)
     environment.close()
-    return found
+    return version
 
 
 def describe_task(
@@ -132,7 +139,7 @@ def describe_task(
         text = records.canonical_json(settings)
     except (TypeError, ValueError) as error:
         raise UserError(f"settings of task {name}: {error}") from error
-    entry = {"name": name, "version": _inspected(registered, text)[0], "settings": dict(settings)}
+    entry = {"name": name, "version": _task_version(registered, text), "settings": dict(settings)}
     return entry if base is None else {**entry, "base": base}
 
 
@@ -144,8 +151,15 @@ def installed(task: TaskOrName) -> dict[str, Any]:
 
 def described(entry: Mapping[str, Any]) -> Described:
     """A task's entry with the traits of its environment."""
-    found = _inspected(base_of(entry), records.canonical_json(settings_of(entry)))
-    return Described(entry, found[1])
+    return Described(entry, _traits(records.canonical_json(entry)))
+
+
+@functools.cache
+def _traits(entry_json: str) -> Traits:
+    envs = make_envs(json.loads(entry_json), 1)  # the batched one, which is what runs are made of
+    found = traits(envs)
+    envs.close()
+    return found
 
 
 def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
@@ -365,7 +379,10 @@ class _Resolver:
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
         """The entry of a task by its name in the configuration."""
-        overrides, variant = self.config.task_overrides.get(name), self.config.task_variants.get(name)
+        overrides, variant = (
+            self.config.task_overrides.get(name),
+            self.config.task_variants.get(name),
+        )
         given = dict(overrides.settings) if overrides else {}
         if variant is None:
             if name not in task_names():
