@@ -182,7 +182,6 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     task = _task(arguments, settings)
     algorithm = runs.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
-    task = runs.describe_task(arguments.task, settings, "--task")
     values = runs.hyperparameters(algorithm, overrides, "--set")
     runs.check_setting(algorithm, values, task, arguments.steps, arguments.algorithm)
     run = runs.make_run(

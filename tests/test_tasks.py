@@ -25,7 +25,7 @@ def small(**changes: Any) -> dict[str, Any]:
         "tasks": [GOAL, {"Pillars-8": EIGHT}],
         "algorithms": {"SafeMR": {"algorithm": "safemr"}, "CPO": {"algorithm": "cpo"}},
         "seeds": [0],
-        "budget": {"off_policy": 2000, "on_policy": 4000},
+        "budget": {"off_policy": 20_000, "on_policy": 40_000},
         "log_points": 4,
         "evaluation": {"points": 2, "episodes": 2},
         **changes,
@@ -68,7 +68,7 @@ def test_the_forms_of_tasks_say_the_same() -> None:
         ({"tasks": {PUSH: EIGHT}}, f"{PUSH!r} is the name of a registered task"),
         ({"tasks": {PUSH.lower(): EIGHT}}, "is the name of a registered task"),
         ({"tasks": {"X": {**EIGHT, "base": "Pillars-0.15-Gaol"}}}, f"did you mean {GOAL!r}?"),
-        ({"tasks": {"X": {**EIGHT, "settings": {"obstacles": 8}}}}, "has no setting 'obstacles'"),
+        ({"tasks": {"X": {**EIGHT, "settings": {"obstacles": 8}}}}, "unknown setting 'obstacles'"),
         ({"tasks": {"X": {**EIGHT, "settings": {"num_obstacles": 0}}}}, "num_obstacles"),
         ({"tasks": {"X": {**EIGHT, "settings": {}}}}, f"is empty: then it is {GOAL} itself"),
         ({"tasks": {"X": {"base": GOAL}}}, "tasks.X lacks 'settings'"),
@@ -96,13 +96,13 @@ def test_what_cannot_be_is_one_line(changes: dict[str, Any], said: str) -> None:
 
 def test_budgets_and_the_simulations_settings_are_overrides_of_any_name() -> None:
     crates = {"base": PUSH, "settings": {"num_obstacles": 2}}
-    override = {"settings": {"sleep": True}, "budget": {"off_policy": 1000}}
+    override = {"settings": {"sleep": True}, "budget": {"off_policy": 8000}}
     plan = resolve(
         tasks=[PUSH, {"Crates": crates}], task_overrides={PUSH: override, "Crates": override}
     )
     settings = {run.task: run.config["task"]["settings"] for run in plan.runs}
     assert settings == {PUSH: {"sleep": True}, "Crates": {"num_obstacles": 2, "sleep": True}}
-    assert {run.config["steps"] for run in plan.runs if run.variant == "SafeMR"} == {1000}
+    assert {run.config["steps"] for run in plan.runs if run.variant == "SafeMR"} == {8000}
 
 
 def test_what_a_task_has_is_no_question_of_its_name() -> None:
@@ -167,7 +167,7 @@ def test_a_state_found_on_a_task_is_replayed_on_it() -> None:
 
 def test_the_command_line_names_a_task_as_the_configuration_does() -> None:
     common = ["--task", GOAL, "--algorithm", "safemr", "--set", "task.num_obstacles=8"]
-    common += ["--seed", "0", "--steps", "2000", "--log-points", "4", "--eval-episodes", "2"]
+    common += ["--seed", "0", "--steps", "8000", "--log-points", "4", "--eval-episodes", "2"]
     with pytest.raises(UserError, match=r"makes another task of .*--task-name"):
         train.resolve(train._parse(common))
     resolved, _ = train.resolve(train._parse([*common, "--task-name", "Pillars-8"]))
