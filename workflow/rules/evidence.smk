@@ -60,6 +60,7 @@ rule certificates:
         pictured=[run.path.as_posix() for run in FIRST_RUNS.values() if run.variant in LEARNED],
         states=2**13,
         episodes=min(8, CONFIG.evaluation.episodes),
+        lacking=without_policy(FIRST_RUNS.values()),
         sources=sources("certificates"),
     message:
         "Checking the paper's certificates and %d learned ones" % len(FIRST_RUNS)

@@ -185,6 +185,9 @@ rule rollouts:
         settings=lambda wildcards: SETTINGS.get(wildcards.task, {}),
         layouts=[CONFIG.evaluation.seed + index for index in range(4)],
         steps=400,
+        lacking=lambda wildcards: without_policy(
+            run for run in FIRST_RUNS.values() if run.task == wildcards.task
+        ),
         sources=sources("rollouts"),
     script:
         "../scripts/rollouts.py"
