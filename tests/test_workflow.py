@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,9 +86,9 @@ class Checkout:
         assert (process.returncode == 0) == check, printed
         return printed
 
-    def scheduled(self, *arguments: str) -> dict[str, int]:
+    def scheduled(self, *arguments: str, targets: Sequence[str] = ("all",)) -> dict[str, int]:
         """Rule -> number of jobs of a dry run."""
-        printed = self.snakemake("-n", "all", *arguments)
+        printed = self.snakemake("-n", *targets, *arguments)
         table = printed.partition("Job stats:")[2].partition("total")[0]
         return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M)}
 
@@ -153,6 +153,67 @@ def test_what_is_recorded_can_be_drawn_without_training(checkout: Checkout) -> N
     assert f"Runs missing: {lost.variant} on {lost.task} (seed" in table
 
 
+def test_an_edit_makes_again_what_depends_on_it_and_only_that(checkout: Checkout) -> None:
+    checkout.fill_in_records()
+    made = ("table_1", "training_curves", "illustrations")
+    checkout.snakemake(*made)
+    assert checkout.scheduled(targets=made) == {}
+    everything = {"aggregate": 1, "controllers": 1, **dict.fromkeys(made, 1)}
+    for source, expected in {
+        "safemr/plotting/certificate.py": {"illustrations": 1},
+        "envs/drawing.py": {"illustrations": 1},
+        "safemr/comparisons.py": {"table_1": 1},
+        "safemr/plotting/curves.py": {"training_curves": 1},
+        "envs/assets/point.xml": {"illustrations": 1, "controllers": 1, "table_1": 1},
+        "safemr/records.py": everything,
+        "safemr/algorithms/fac.py": {},
+        "safemr/off_policy.py": {},
+        "safemr/claims.py": {},
+    }.items():
+        path = checkout.folder / source
+        before, times = path.read_text(), (path.stat().st_atime, path.stat().st_mtime)
+        path.write_text(before + ("<!-- -->" if path.suffix == ".xml" else "# edited\n"))
+        assert checkout.scheduled(targets=made) == expected, source
+        path.write_text(before)
+        os.utime(path, times)
+    assert checkout.scheduled(targets=made) == {}
+
+
+def test_a_policy_that_comes_or_goes_is_noticed(checkout: Checkout) -> None:
+    """policy.npz is optional in a record and hence no input of what flies it."""
+    checkout.fill_in_records()
+    record = next(run for run in checkout.plan().runs if run.variant == "SafeMR")
+    policy = checkout.folder / "results" / record.path / records.POLICY
+    target = "results/summary/rollouts/Pillars-0.15-Goal.npz"
+    checkout.snakemake(target)
+    assert checkout.scheduled(targets=[target]) == {}
+    policy.write_bytes(b"")
+    assert checkout.scheduled(targets=[target]) == {"rollouts": 1}
+    policy.unlink()
+    assert checkout.scheduled(targets=[target]) == {}
+
+
+def test_a_clone_draws_everything_once_and_then_nothing(checkout: Checkout) -> None:
+    """Without Snakemake's memory it cannot be known that a tracked picture is current.
+
+    As `git clone` and an archive have it: the scripts are not older than any output.
+    """
+    checkout.fill_in_records()
+    made = ("table_1", "training_curves")
+    checkout.snakemake(*made)
+    shutil.rmtree(checkout.folder / ".snakemake")
+    tracked = [*checkout.folder.glob("results/**/*"), *checkout.folder.glob("paper_figures/*")]
+    for path in [*tracked, *checkout.folder.rglob("*.py")]:
+        os.utime(path, (1.7e9, 1.7e9))
+    before = {path: path.read_bytes() for path in tracked if path.suffix in (".md", ".png", ".csv")}
+    (checkout.folder / "results/summary/progress.csv.gz").unlink()  # is not tracked
+    everything = {"aggregate": 1, "controllers": 1, **dict.fromkeys(made, 1)}
+    assert checkout.scheduled(targets=made) == everything
+    checkout.snakemake(*made)
+    assert {path: path.read_bytes() for path in before} == before
+    assert checkout.scheduled(targets=made) == {}
+
+
 def test_adding_a_baseline_is_one_file_and_one_line(checkout: Checkout) -> None:
     checkout.fill_in_records()
     algorithms = checkout.folder / "safemr/algorithms"
@@ -162,6 +223,17 @@ def test_adding_a_baseline_is_one_file_and_one_line(checkout: Checkout) -> None:
     path.write_text(path.read_text().replace("algorithms:\n", line))
     jobs = checkout.scheduled()
     assert jobs["train"] == len(GRID["tasks"]) * len(GRID["seeds"])
+    # The tests take it as it is; once it has records, its behaviour must be on record too.
+    shutil.copytree(ROOT / "tests", checkout.folder / "tests")
+    command = [sys.executable, "-m", "pytest", "-q", "tests/test_fingerprints.py", "-k", "my_base"]
+    (record, *_) = (checkout.folder / "results/runs").glob("*/FAC-phi0/seed*/config.json")
+    for content, outcome in (
+        (record.read_text(), "1 skipped"),
+        (json.dumps({"algorithm": {"name": "my_baseline"}}), "runs of my_baseline are recorded"),
+    ):
+        record.write_text(content)
+        done = subprocess.run(command, cwd=checkout.folder, capture_output=True, text=True)
+        assert outcome in done.stdout, done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(

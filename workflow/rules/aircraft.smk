@@ -49,6 +49,7 @@ rule aircraft_comparison:
         root=RESULTS,
         folders=[run.path.as_posix() for run in AIRCRAFT],
         expected=expected(AIRCRAFT_PLAN),
+        lacking=without_policy(AIRCRAFT),
         sources=sources("aircraft_comparison"),
     message:
         "Comparing %d learned certificates with the true unsafe set" % len(AIRCRAFT)
@@ -108,6 +109,7 @@ rule aircraft_neural:
         folders=[run.path.as_posix() for run in NEURAL],
         expected=expected(NEURAL_PLAN),
         energy=[run.config["algorithm"]["hyperparameters"] for run in NEURAL_PLAN[:1]],
+        lacking=without_policy(NEURAL),
         sources=sources("aircraft_neural"),
     message:
         "Comparing %d neural certificates with the true unsafe set" % len(NEURAL)

@@ -11,7 +11,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 
 from safemr.config import load
 from safemr.errors import UserError
-from safemr.records import REQUIRED_FILES
+from safemr.records import POLICY, PROVENANCE, REQUIRED_FILES
 from safemr.plan_cache import plan_for
 from safemr import reference
 from safemr.sources import digest
@@ -65,3 +65,13 @@ def one_of(names):
 def sources(script):
     """A digest of what workflow/scripts/<script>.py uses: an edit there runs its rule again."""
     return digest(os.path.join(workflow.basedir, f"workflow/scripts/{script}.py"))
+
+
+def without_policy(runs):
+    """Which recorded runs lack policy.npz, which is optional and hence no input.
+
+    A parameter of what reads policies, which is made again when one comes or goes.
+    """
+    folders = [f"{RESULTS}/{run.path}" for run in runs]
+    complete = [folder for folder in folders if os.path.exists(f"{folder}/{PROVENANCE}")]
+    return [folder for folder in complete if not os.path.exists(f"{folder}/{POLICY}")]

@@ -69,6 +69,7 @@ rule certificates:
         ],
         states=2**13,
         episodes=min(8, CONFIG.evaluation.episodes),
+        lacking=without_policy(FIRST_RUNS.values()),
         sources=sources("certificates"),
     message:
         "Checking %d learned certificates%s" % (len(FIRST_RUNS), " and the paper's" * WITH_PAPERS)

@@ -195,6 +195,9 @@ rule rollouts:
         },
         layouts=[CONFIG.evaluation.seed + index for index in range(4)],
         steps=lambda wildcards: min(400, PLAN.tasks[wildcards.task].traits.episode_steps),
+        lacking=lambda wildcards: without_policy(
+            run for run in FIRST_RUNS.values() if run.task == wildcards.task
+        ),
         sources=sources("rollouts"),
     script:
         "../scripts/rollouts.py"

@@ -20,6 +20,7 @@ rule unseen_layouts:
         folders=lambda wildcards: list(FLOWN[wildcards.task]),
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
         seed=CONFIG.unseen_layouts and CONFIG.unseen_layouts.seed,
+        lacking=lambda wildcards: without_policy(FLOWN[wildcards.task].values()),
         sources=sources("unseen_layouts"),
     message:
         "Flying the final policies of {wildcards.task} on {params.episodes} unseen layouts"

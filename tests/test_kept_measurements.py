@@ -1,0 +1,211 @@
+"""The measurements that the repository keeps are what its code measures.
+
+What is kept is believed as long as its key is the same, and the key holds a version, no sources:
+measuring code that gives other numbers without a new version would leave old ones standing. So one
+measurement of every kind is made again from the same record and compared.
+
+On the processor that measured first all numbers are equal. Elsewhere powers, sines and the
+network's matrix products differ in their last bits. Flights return to the same course, which
+leaves 1e-6 or so; where a bit decides about a threshold, one state, step or flight is counted on
+the other side. So numbers are compared to 1e-3 and shares to a few of what was counted (`TOLERANCE`);
+a change of what is measured moves more.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from safemr import (
+    aircraft_evidence,
+    certify,
+    controllers,
+    evaluate,
+    measurements,
+    neural_evidence,
+    records,
+    rollouts,
+)
+from safemr.measurements import HEADER, Measurements
+from safemr.plotting import data
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+QUICK = RESULTS / "quick"  # has every kind, the neural energies too
+TASK = "Pillars-0.15-Goal"
+
+
+class Again:
+    """A results root in which things are measured again, with records of another root."""
+
+    def __init__(self, recorded: Path, root: Path, solved: Path) -> None:
+        self.recorded, self.root, self.solved = recorded, root, solved
+        self.measurements = Measurements(root)
+
+    def kept(self, kind: str, label: str) -> tuple[Path, dict[str, Any]]:
+        """The file that the repository keeps under a label, and its header."""
+        (path,) = (self.recorded / measurements.FOLDER / kind).glob(f"{label}-*")
+        if path.suffix == ".json":
+            return path, json.loads(path.read_text())
+        return path, json.loads(str(data.load(path)[HEADER]))
+
+    def record(self, inputs: Mapping[str, Any]) -> Path:
+        """A copy of the record that a measurement was made on."""
+        place = Path("runs", inputs["record"])
+        shutil.copytree(self.recorded / place, self.root / place, dirs_exist_ok=True)
+        return self.root / place
+
+    def sets(self, log2_states: int) -> aircraft_evidence.TrueSets:
+        return aircraft_evidence.TrueSets.cached(self.solved, log2_states)
+
+    def frontier(self) -> pd.DataFrame:
+        _, entry = self.kept("aircraft_frontier", "frontier")
+        return pd.DataFrame(entry["value"])
+
+
+def the_controllers(again: Again) -> None:
+    inputs = again.kept("controllers", TASK)[1]["inputs"]
+    controllers.measured_scores(
+        again.measurements, [TASK], seeds=inputs["seeds"], episodes=inputs["episodes"],
+        settings={TASK: inputs["task"]["settings"]},
+    )  # fmt: skip
+
+
+def a_learned_certificate(again: Again) -> None:
+    inputs = again.kept("certificates", f"{TASK}-SafeMR-seed*")[1]["inputs"]
+    certificate, task, settings = certify.certificate_of_record(again.record(inputs["policy"]))
+    certify.measured_certificate(
+        again.measurements, certificate, task, states=inputs["states"],
+        episodes=inputs["episodes"], settings=settings,
+    )  # fmt: skip
+
+
+def the_margins(again: Again) -> None:
+    inputs = again.kept("certificates", f"{TASK}-SafeMR-seed*")[1]["inputs"]
+    certificate, task, _ = certify.certificate_of_record(again.record(inputs["policy"]))
+    certify.measured_margins(again.measurements, certificate, task)
+
+
+def the_rollouts(again: Again) -> None:
+    inputs = again.kept("rollouts", f"{TASK}-SafeMR-seed*")[1]["inputs"]
+    certificate, task, settings = certify.certificate_of_record(again.record(inputs["policy"]))
+    rollouts.measured(
+        again.measurements, certificate, task, layouts=inputs["layouts"], steps=inputs["steps"],
+        settings=settings,
+    )  # fmt: skip
+
+
+def unseen_layouts(again: Again) -> None:
+    inputs = again.kept("unseen_layouts", f"{TASK}-CPO-seed0")[1]["inputs"]
+    evaluate.measured(
+        again.measurements, again.record(inputs), episodes=inputs["episodes"], seed=inputs["seed"]
+    )
+
+
+def the_frontier(again: Again) -> None:
+    inputs = again.kept("aircraft_frontier", "frontier")[1]["inputs"]
+    aircraft_evidence.measured_frontier(again.measurements, again.sets(inputs["log2_states"]))
+
+
+def learners_and_references(again: Again) -> None:
+    inputs = again.kept("aircraft_learners", "Aircraft-SafeMR-seed0")[1]["inputs"]
+    folder = again.record(inputs["policy"])
+    runs, _ = records.read_records(again.root, [folder.relative_to(again.root)])
+    aircraft_evidence.compare(
+        again.sets(inputs["log2_states"]), again.frontier(), again.root, runs, inputs["flights"]
+    )
+
+
+def the_slices(again: Again) -> None:
+    nothing_learned = pd.DataFrame({"kind": [], "variant": []})
+    aircraft_evidence.slices(again.sets(19), nothing_learned, again.measurements)
+
+
+def neural_energies(again: Again) -> None:
+    inputs = again.kept("aircraft_neural", "neural")[1]["inputs"]
+    folders = [again.record(policy) for policy in inputs["policies"]]
+    runs, _ = records.read_records(again.root, [f.relative_to(again.root) for f in folders])
+    config = json.loads((folders[0] / records.CONFIG).read_text())
+    neural_evidence.measured(
+        again.measurements, again.sets(inputs["log2_states"]), again.frontier(), again.root, runs,
+        config["algorithm"]["hyperparameters"],
+    )  # fmt: skip
+
+
+CASES: Mapping[Callable[[Again], None], tuple[Path, tuple[str, ...]]] = {
+    the_controllers: (RESULTS, ("controllers",)),
+    a_learned_certificate: (RESULTS, ("certificates",)),
+    the_margins: (RESULTS, ("margins",)),
+    the_rollouts: (RESULTS, ("rollouts",)),
+    unseen_layouts: (RESULTS, ("unseen_layouts",)),
+    the_frontier: (RESULTS, ("aircraft_frontier",)),
+    learners_and_references: (RESULTS, ("aircraft_learners", "aircraft_references")),
+    the_slices: (RESULTS, ("aircraft_slices",)),
+    neural_energies: (QUICK, ("aircraft_neural", "aircraft_neural_slice")),
+}
+
+
+def differences(now: Any, before: Any, place: str = "") -> list[tuple[str, float]]:
+    """Every number's place and difference, relative where it is above 1; inf where not alike."""
+    if isinstance(before, dict):
+        if now.keys() != before.keys():
+            return [(place, np.inf)]
+        return [d for k in before for d in differences(now[k], before[k], f"{place}/{k}")]
+    if isinstance(before, list):
+        if len(now) != len(before):
+            return [(place, np.inf)]
+        pairs = enumerate(zip(now, before, strict=True))
+        return [d for i, (a, b) in pairs for d in differences(a, b, f"{place}[{i}]")]
+    if isinstance(before, np.ndarray):
+        if now.shape != before.shape or now.dtype != before.dtype:
+            return [(place, np.inf)]
+        if before.dtype.kind in "fc":
+            gaps = np.abs(now - before) / np.fmax(1.0, np.abs(before))
+            alike = np.isnan(now) == np.isnan(before)
+            return [(place, float(np.where(alike, np.nan_to_num(gaps), np.inf).max(initial=0)))]
+        return [(place, 0.0 if np.array_equal(now, before) else np.inf)]
+    if isinstance(before, float) and isinstance(now, float):
+        if np.isnan(before) or np.isnan(now):
+            return [(place, 0.0 if np.isnan(before) == np.isnan(now) else np.inf)]
+        return [(place, abs(now - before) / max(1.0, abs(before)))]
+    return [(place, 0.0 if now == before else np.inf)]
+
+
+def content(path: Path) -> Any:
+    if path.suffix == ".json":
+        return json.loads(path.read_text())["value"]
+    return {name: values for name, values in data.load(path).items() if name != HEADER}
+
+
+def test_every_kind_is_measured_again_by_some_case() -> None:
+    kinds = [kind for _, made in CASES.values() for kind in made]
+    assert sorted(kinds) == sorted(measurements.VERSIONS)
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("solved")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("measure", CASES, ids=lambda function: function.__name__)
+def test_the_repository_keeps_what_its_code_measures(
+    measure: Callable[[Again], None], tmp_path: Path, solved: Path
+) -> None:
+    """Otherwise VERSIONS was not raised with a change of the measuring code."""
+    recorded, kinds = CASES[measure]
+    measure(Again(recorded, tmp_path, solved))
+    made = {path.parent.name: path for path in (tmp_path / measurements.FOLDER).glob("*/*")}
+    assert made.keys() == set(kinds)
+    for kind, path in made.items():
+        kept = recorded / measurements.FOLDER / kind / path.name
+        assert kept.exists(), f"{kind}: inputs or version are others than those kept: redraw"
+        found = differences(content(path), content(kept))
+        far = [(place, gap) for place, gap in found if gap > 0]
+        print(kind, len(found), sorted(far, key=lambda x: -x[1])[:12])
