@@ -23,7 +23,7 @@ from safemr.errors import UserError
 )
 def test_values_of_a_command_line(text: str, value: Any) -> None:
     assert strict_yaml.typed(text) == value
-    assert train._override(f"gamma={text}") == ("gamma", value)
+    assert strict_yaml.assignment(f"gamma={text}") == ("gamma", value)
 
 
 @pytest.mark.parametrize(
