@@ -98,7 +98,7 @@ def highest_safe_return(task: str, evidence: Evidence) -> Finding:
     claim holds as soon as SafeMR is safe.
     """
     baselines = reference.BASELINES
-    absent = evidence.lacking([(task, v) for v in (reference.METHOD, *baselines)])
+    absent = evidence.lacking(task, (reference.METHOD, *baselines))
     if absent:
         return absent
     ours = evidence.of(task, reference.METHOD, "eval_return")
@@ -254,7 +254,7 @@ def parameters_feasible(group: str, evidence: Evidence) -> Finding:
     if rows is None or rows.empty:
         what = f"certify results of {group}"
         asked = group != "paper" and evidence.asks_for((task, group) for task in evidence.tasks)
-        return unavailable(what) if asked else not_run(what)
+        return unavailable(what) if asked or evidence.expected is None else not_run(what)
     worst = rows.sort_values("worst_margin").iloc[-1]
     share = float(rows["infeasible_share"].max())
     estimate = Estimate(float(worst["worst_margin"]), np.nan, np.nan, len(rows))

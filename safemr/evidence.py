@@ -84,10 +84,11 @@ class Evidence:
         asked = set(zip(self.expected["task"], self.expected["variant"], strict=True))
         return any(pair in asked for pair in pairs)
 
-    def lacking(self, pairs: Sequence[tuple[str, str]]) -> Finding | None:
-        """The finding where runs of these pairs are missing, or are none of the grid's."""
+    def lacking(self, task: str, variants: Sequence[str]) -> Finding | None:
+        """The finding where runs on a task are missing, or are none of the grid's."""
+        pairs = [(task, variant) for variant in variants]
         if not self.asks_for(pairs):
-            return not_run("; ".join(f"{variant} on {task}" for task, variant in pairs))
+            return not_run(f"{', '.join(variants)} on {task}")
         absent = self.missing(pairs)
         return unavailable(absent) if absent else None
 
@@ -95,7 +96,7 @@ class Evidence:
         """The finding where the aircraft comparison lacks runs of these learners."""
         pairs = [(reference.AIRCRAFT_TASK, variant) for variant in variants]
         if not self.asks_for(pairs):
-            return not_run("; ".join(f"{variant} on {task}" for task, variant in pairs))
+            return not_run(f"{', '.join(variants)} on {reference.AIRCRAFT_TASK}")
         absent = self.missing_flights(variants)
         return unavailable(absent) if absent else None
 

@@ -39,9 +39,9 @@ def episodes(
     """The first `steps` steps of the deterministic policy, one episode a seed.
 
     Returns robot [T+1, N, 3] (x, y, heading), goal [T+1, N, 2], box [T+1, N, 3] (nan without a
-    box), vase [T+1, N, 3] in a task that has one, obstacles [N, M, 2], reward [T, N], cost_indicator [T, N], goal_met [T, N], and the task's
-    geometry. The same seeds give the same layouts to every policy. Raises UserError for more steps
-    than an episode has.
+    box), vase [T+1, N, 3] in a task that has one, obstacles [N, M, 2], reward [T, N],
+    cost_indicator [T, N], goal_met [T, N], and the task's geometry. The same seeds give the same
+    layouts to every policy. Raises UserError for more steps than an episode has.
     """
     envs = make_simulator(task, len(seeds))
     if steps > envs.max_episode_steps:

@@ -25,7 +25,7 @@ from safemr import records, reference
 from safemr.config import FAMILIES, Config, Variant, unknown
 from safemr.errors import UserError
 from safemr.strict_yaml import show
-from safemr.tasks import Described, Traits, base_of, name_of, settings_of, task_settings, traits
+from safemr.tasks import Described, base_of, make_envs, name_of, settings_of, task_settings, traits
 from safemr.tasks import Task as TaskOrName
 
 _ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
@@ -134,8 +134,7 @@ def task_names() -> list[str]:
 
 
 @functools.cache
-def _inspected(name: str, settings_json: str) -> tuple[int, Traits]:
-    """Version and traits of a registered task with these settings."""
+def _task_version(name: str, settings_json: str) -> int:
     gymnasium = importlib.import_module("gymnasium")
     settings = json.loads(settings_json)
     try:
@@ -147,9 +146,9 @@ def _inspected(name: str, settings_json: str) -> tuple[int, Traits]:
                 raise unknown("setting", setting, known, f"task {name}") from error
         reason = str(error).partition(" was raised from the environment creator")[0]
         raise UserError(f"task {name}: {reason.partition(chr(10))[0]}") from error
-    found = int(environment.unwrapped.task_version), traits(environment.unwrapped)
+    version = int(environment.unwrapped.task_version)
     environment.close()
-    return found
+    return version
 
 
 def _setting_names(name: str) -> list[str]:
@@ -177,7 +176,7 @@ def describe_task(
         text = records.canonical_json(settings)
     except (TypeError, ValueError) as error:
         raise UserError(f"settings of task {name}: {error}") from error
-    entry = {"name": name, "version": _inspected(registered, text)[0], "settings": dict(settings)}
+    entry = {"name": name, "version": _task_version(registered, text), "settings": dict(settings)}
     return entry if base is None else {**entry, "base": base}
 
 
@@ -189,8 +188,10 @@ def installed(task: TaskOrName) -> dict[str, Any]:
 
 def described(entry: Mapping[str, Any]) -> Described:
     """A task's entry with the traits of its environment."""
-    found = _inspected(base_of(entry), records.canonical_json(settings_of(entry)))
-    return Described(entry, found[1])
+    envs = make_envs(entry, 1)  # the batched one, which is what runs are made of
+    found = traits(envs)
+    envs.close()
+    return Described(entry, found)
 
 
 def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
@@ -440,7 +441,10 @@ class _Resolver:
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
         """The entry of a task by its name in the configuration."""
-        overrides, variant = self.config.task_overrides.get(name), self.config.task_variants.get(name)
+        overrides, variant = (
+            self.config.task_overrides.get(name),
+            self.config.task_variants.get(name),
+        )
         given = dict(overrides.settings) if overrides else {}
         if variant is None:
             if name not in task_names():

@@ -43,9 +43,10 @@ def table_two(
             **{name: [number(value, 3) for value in data[name]] for name in ("sigma", "k", "n")},
         }
     )
-    beside = ", and the paper's" if task == reference.SENSITIVITY_TASK else ""
+    papers = task == reference.SENSITIVITY_TASK
+    beside = ", and the paper's" if papers else ""
     caption = (
-        f"Table II. Learned energy-function parameters on {task} for each [a, b]: last value of "
+        f"{'Table II. ' * papers}Learned energy-function parameters on {task} for each [a, b]: last value of "
         f"each run, mean and half width of the 95% t interval over seeds{beside}."
     )
     return Table("table2", caption, data, display, missing_notes(missing, [task], list(points)))

@@ -251,9 +251,10 @@ def full_results(
         "Full results: final performance of the deterministic policy (mean over the last 10% of "
         f"evaluations, on {layouts} fixed layouts), mean over seeds ± half width of the 95% t "
         f"interval, or [its ends] where it is cut off at a bound of the quantity. {FEW} From four "
-        "seeds on the IQM in brackets after the return. Cost is the authors' (pillars: contact steps of "
-        "the body; hazards: summed depth); any contact counts the robot's nose too; in all of "
-        "training: violating steps of a whole run, whose length differs between the families. "
+        "seeds on the IQM in brackets after the return. Cost is the authors' (pillars: contact "
+        "steps of the body; hazards: summed depth); any contact counts the robot's nose too; in "
+        "all of training: violating steps of a whole run, whose length differs between the "
+        "families. "
         f"{str(rule).capitalize()}. Scripted controllers see the full state and are not learned."
     )
     return Table(name, caption, data, display, missing_notes(missing, None, None))

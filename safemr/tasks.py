@@ -2,9 +2,9 @@
 
 A run's config says its task as a mapping: ``name``, ``version``, ``settings`` and, where the name
 is not a registered one, ``base``, the registered task that the settings change. A task with other
-settings is another task and has its own name, so what is said of a name (the paper's values, its
-claims) never meets numbers of something else. Whoever needs an environment of a run asks `make_envs`
-here; whether a drawing, a check or a controller makes sense for a task, its `Traits` say.
+settings is another task and has its own name, so that what is said of a name (the paper's values,
+its claims) never meets numbers of something else. Whoever needs an environment of a run asks
+`make_envs`; whether a drawing, a check or a controller makes sense for a task, its `Traits` say.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
-
-from safemr import reference
 
 # The ``task`` entry of a run's config (`safemr.runs.describe_task`), or the name of a registered
 # task, which then has its own settings.
@@ -60,11 +58,6 @@ def task_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in SIMULATION}
 
 
-def is_paper(task: str) -> bool:
-    """Whether the paper ran the task of this name."""
-    return task in reference.TASKS
-
-
 def make_envs(task: Task, num_envs: int) -> Any:
     """A batched environment of a task."""
     import gymnasium
@@ -85,5 +78,3 @@ def traits(environment: Any) -> Traits:
         pushes_box=bool(getattr(task, "has_box", False)),
         episode_steps=getattr(environment, "max_episode_steps", None),
     )
-
-

@@ -52,9 +52,9 @@ def table(
     """A row an algorithm and task: return, its change against the final evaluations, how far it is
     behind SafeMR's, violations.
 
-    flown: `measured_scores`. scores: `statistics.final_scores`, of evaluations on ``layouts``. The upper end is Clopper and
-    Pearson's one-sided 95% bound on the probability that an episode has a violation, as if all
-    episodes of all seeds were independent.
+    flown: `measured_scores`. scores: `statistics.final_scores`, of evaluations on ``layouts``. The
+    upper end is Clopper and Pearson's one-sided 95% bound on the probability that an episode has a
+    violation, as if all episodes of all seeds were independent.
     """
     rule = rule or SafetyRule()
     rows = []

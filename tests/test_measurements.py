@@ -168,14 +168,13 @@ def test_the_repository_keeps_what_its_code_measures(
     if kind == "controllers":
         task = inputs["task"]
         controllers.measured_scores(
-            kept, [task["name"]], seeds=inputs["seeds"], episodes=inputs["episodes"],
-            settings={task["name"]: task["settings"]},
-        )  # fmt: skip
+            kept, [task], seeds=inputs["seeds"], episodes=inputs["episodes"]
+        )
     elif kind == "certificates":
         (certificate,) = (c for c in certify.paper_certificates() if c.name == inputs["name"])
         certify.measured_certificate(
-            kept, certificate, inputs["task"]["name"], states=inputs["states"],
-            episodes=inputs["episodes"], settings={},
+            kept, certificate, inputs["task"], states=inputs["states"],
+            episodes=inputs["episodes"],
         )  # fmt: skip
     else:
         cache = tmp_path_factory.mktemp("solved")

@@ -31,12 +31,12 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
             "hyperparameters": {"population": 4, "elites": 2},
         }
     }
-    short = {"Pillars-0.15-Goal": {"settings": {"max_episode_steps": 50}}}
+    short = {"base": "Pillars-0.15-Goal", "settings": {"max_episode_steps": 50}}
     config = load(
         [ROOT / "config/smoke.yaml"],
-        {"outside": outside, "task_overrides": short, "tasks": ["Pillars-0.15-Goal"]},
+        {"outside": outside, "tasks": ["Pillars-0.15-Goal", {"Short": short}]},
     )
-    run = resolve(config).outside[0]
+    (run,) = [run for run in resolve(config).outside if run.task == "Short"][:1]
     root = tmp_path_factory.mktemp("results")
     command = [
         sys.executable, str(PROGRAM), "--config", run.resolved, "--variant", run.variant,
@@ -55,7 +55,7 @@ def test_record_is_accepted_and_read_like_any_other(record):
     records.verify_record(root / folder)
     index, progress = records.read_records(root)
     assert index[["task", "variant", "seed", "algorithm", "steps"]].iloc[0].tolist() == [
-        "Pillars-0.15-Goal",
+        "Short",
         "CEM",
         100,
         "cross_entropy",

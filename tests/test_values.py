@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from safemr import runs, strict_yaml, train
+from safemr import runs, strict_yaml
 from safemr.errors import UserError
 
 

@@ -132,7 +132,7 @@ def aggregate_scores(
     absent: Sequence[str] = (),
     tasks: Sequence[str] = (),
 ) -> Figure:
-    """Performance profiles over several tasks, IQM of the normalised score, probability of improvement.
+    """Performance profiles over tasks, IQM of the normalised score, probability of improvement.
 
     aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn, but
     named if it is among `absent`. `tasks` are named where they are not all of the grid's. Where a
