@@ -154,7 +154,7 @@ def test_a_state_found_on_a_task_is_replayed_on_it() -> None:
     """A search on larger obstacles has their d_min, and so has the replay of what it found."""
     wide = {"name": "Wide", "base": GOAL, "version": 1, "settings": {"obstacle_size": 0.3}}
     envs = make_simulator(wide, 32)
-    search = falsification.falsify(envs, PHI_H, count=64, rounds=1, task=wide)
+    search = falsification.falsify(envs, wide, PHI_H, count=64, rounds=1)
     envs.close()
     example = json.loads(json.dumps(search.example()))
     assert (example["task"], example["base"]) == ("Wide", GOAL)
