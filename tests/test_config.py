@@ -86,8 +86,8 @@ NOT_A_ROOT = [
     str(ROOT / "README.md"),
 ]
 
-# Each value is of its type; with the task (two actions, episodes of 1,000 steps) and the budget (1,000
-# steps) it can only end in absurd numbers or in nothing learned.
+# Each value is of its type; with the task (two actions, episodes of 1,000 steps) and the budget
+# (1,000 steps) it can only end in absurd numbers or in nothing learned.
 HOPELESS: list[dict[str, Any]] = [
     *({"target_entropy": value} for value in [2 * math.log(2), 1.4, 2.0, 1e9]),
     *(
