@@ -42,7 +42,12 @@ def main(arguments: Sequence[str]) -> int:
     if command == "lock" and not rest:
         return write_lock()
     if command == "all":
-        return check(rest) or run("python", "-m", "snakemake", "-j2", "--keep-going", "all", *rest)
+        # Of a dry run: what is trained and how many jobs there are. Snakemake's reasons name every
+        # file of every record in one line; `snakemake -n all` prints them.
+        quiet = ["--quiet", "rules", "host"] if any(map(is_dry, rest)) else []
+        return check(rest) or run(
+            "python", "-m", "snakemake", "-j2", *quiet, "--keep-going", "all", *rest
+        )
     if command == "test":
         return run("python", "-m", "pytest", "-n", "2", "-m", "not slow", *rest)
     if command == "run" and rest and rest != ["--"]:
@@ -67,6 +72,11 @@ def run(*command: str) -> int:
         return subprocess.run([program, *command[1:]], cwd=ROOT, env=variables).returncode
     except KeyboardInterrupt:
         return 130
+
+
+def is_dry(argument: str) -> bool:
+    """Whether an argument asks Snakemake for a dry run: -n, -np, --dry-run."""
+    return bool(re.fullmatch(r"-[a-zA-Z]*n[a-zA-Z]*|--dry-?run", argument))
 
 
 def check(arguments: Sequence[str]) -> int:

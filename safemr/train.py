@@ -1,6 +1,6 @@
 """One training run from a resolved configuration to its record.
 
-    python -m safemr.train --task Pillars-0.15-Goal --algorithm safemr --seed 100 --steps 100000
+    safemr train --task Pillars-0.15-Goal --algorithm safemr --seed 100 --steps 100000
 
 The pipeline calls the same program with ``--resolved`` (the run's configuration as JSON). Whatever
 the algorithm, this file evaluates, records, checkpoints and resumes; the algorithm only trains.
@@ -124,10 +124,18 @@ def train(
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m safemr.train", description=__doc__)
-    parser.add_argument("--task", help="for instance Pillars-0.15-Goal")
+    parser = argparse.ArgumentParser(
+        prog="safemr train",
+        description=__doc__,
+        epilog="Tasks, algorithms and what can be --set, with defaults and meaning: "
+        "`safemr list`, `safemr list ALGORITHM`.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    asked = {"-h", "--help"} & set(sys.argv[1:] if argv is None else argv)
+    tasks = ", ".join(runs.task_names()) if asked else ""  # imports the simulator
+    parser.add_argument("--task", help=f"one of {tasks}")
     parser.add_argument("--task-name", help="what the task is called with settings of its own")
-    parser.add_argument("--algorithm", help="a file in safemr/algorithms, for instance safemr")
+    parser.add_argument("--algorithm", help=f"one of {', '.join(runs.algorithm_names())}")
     parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
     parser.add_argument("--steps", type=int, default=320_000, help="environment steps")
     parser.add_argument(
