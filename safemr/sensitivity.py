@@ -46,8 +46,8 @@ def table_two(
     papers = task == reference.SENSITIVITY_TASK
     beside = ", and the paper's" if papers else ""
     caption = (
-        f"{'Table II. ' * papers}Learned energy-function parameters on {task} for each [a, b]: last value of "
-        f"each run, mean and half width of the 95% t interval over seeds{beside}."
+        f"{'Table II. ' * papers}Learned energy-function parameters on {task} for each [a, b]: "
+        f"last value of each run, mean and half width of the 95% t interval over seeds{beside}."
     )
     return Table("table2", caption, data, display, missing_notes(missing, [task], list(points)))
 
