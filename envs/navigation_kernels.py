@@ -16,8 +16,13 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from envs.tasks import LIDAR_BINS
+from envs import tasks
 
+# Numba keeps compiled code until this file changes, and constants are part of it: what comes from
+# another module is therefore written out here and compared.
+LIDAR_BINS = 16
+if LIDAR_BINS != tasks.LIDAR_BINS:
+    raise ImportError("envs/navigation_kernels.py and envs/tasks.py state different LIDAR_BINS")
 BIN_WIDTH = 2 * math.pi / LIDAR_BINS
 GRAVITY = 9.81
 MAGNETIC_FIELD = 0.5  # along world -y

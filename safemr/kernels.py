@@ -33,13 +33,16 @@ _compiled = numba.njit(
     cache=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"}
 )
 
-_RELU, _ELU = ACTIVATIONS.index("relu"), ACTIVATIONS.index("elu")
+# Cached machine code holds constants until this file changes: those of networks.py are compared.
+_ELU, _RELU = 0, 1
 # A Python float would turn the loops into double precision.
 _0, _HALF, _1, _2 = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
-_LOG_STD_MIN, _LOG_STD_MAX = np.float32(LOG_STD_MIN), np.float32(LOG_STD_MAX)
+_LOG_STD_MIN, _LOG_STD_MAX = np.float32(-20.0), np.float32(2.0)
 _LOG_DENSITY = np.float32(0.5 * math.log(2.0 * math.pi) + 2.0 * math.log(2.0))
 _LINEAR_FROM = np.float32(20.0)  # beyond this softplus(x) = x in float32
 _BETA_1, _BETA_2, _EPSILON = 0.9, 0.999, np.float32(1e-8)  # defaults of torch.optim.Adam
+if ACTIVATIONS[:2] != ("elu", "relu") or (LOG_STD_MIN, LOG_STD_MAX) != (_LOG_STD_MIN, _LOG_STD_MAX):
+    raise ImportError("safemr/kernels.py and safemr/networks.py state different constants")
 
 
 def _use_one_blas_thread() -> None:

@@ -28,8 +28,8 @@ from safemr.plotting import data
 FOLDER = "measurements"
 HEADER = "measurement"  # the array of an npz that says what it is
 
-# Raise a version when the code behind a kind changes what it returns; tests/test_measurements.py
-# measures one of each again and says so.
+# Raise a version when the code behind a kind changes what it returns;
+# tests/test_kept_measurements.py measures one of each again and says so.
 VERSIONS = {
     "controllers": 1,
     "certificates": 1,

@@ -116,6 +116,38 @@ def test_constants_have_one_home() -> None:
     assert {key: found for key, found in homes.items() if len(found) > 1} == {}
 
 
+def _names(node: ast.AST) -> set[str]:
+    return {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_compiled_code_holds_nothing_from_other_modules(path: Path) -> None:
+    """Numba compiles again when the file changes, not when a constant imported into it does."""
+    tree = ast.parse((ROOT / path).read_text())
+    foreign = {
+        alias.asname or alias.name.partition(".")[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+        if (getattr(node, "module", None) or alias.name).partition(".")[0] in ("envs", "safemr")
+    }
+    for node in tree.body:  # and what is made of it at the top of the module
+        if (
+            isinstance(node, ast.Assign | ast.AnnAssign)
+            and node.value
+            and _names(node.value) & foreign
+        ):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            foreign |= {name for target in targets for name in _names(target)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and any(
+            "njit" in ast.unparse(decorator) or "_compiled" in ast.unparse(decorator)
+            for decorator in node.decorator_list
+        ):
+            used = {name for statement in node.body for name in _names(statement)}
+            assert not used & foreign, f"{path}: {node.name} keeps a copy of {used & foreign}"
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=str)
 def test_files_stay_readable(path: Path) -> None:
     assert len((ROOT / path).read_text().splitlines()) <= 450

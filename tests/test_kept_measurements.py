@@ -4,16 +4,18 @@ What is kept is believed as long as its key is the same, and the key holds a ver
 measuring code that gives other numbers without a new version would leave old ones standing. So one
 measurement of every kind is made again from the same record and compared.
 
-On the processor that measured first all numbers are equal. Elsewhere powers, sines and the
-network's matrix products differ in their last bits. Flights return to the same course, which
-leaves 1e-6 or so; where a bit decides about a threshold, one state, step or flight is counted on
-the other side. So numbers are compared to 1e-3 and shares to a few of what was counted (`TOLERANCE`);
-a change of what is measured moves more.
+On the processor that measured first all numbers are equal. Elsewhere powers and sines differ in
+their last bits, which changes nothing here by more than 1e-9, and so do the matrix products of
+networks. Those matter where a policy flies: after some ten steps of a navigation task a robot is
+1e-3 m from where it was, and after a hundred it may pass an obstacle on the other side. What such
+flights say can be compared within their standard errors only, and their courses in the first steps
+only (`TOLERANCE`).
 """
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -102,7 +104,7 @@ def the_rollouts(again: Again) -> None:
 
 
 def unseen_layouts(again: Again) -> None:
-    inputs = again.kept("unseen_layouts", f"{TASK}-CPO-seed0")[1]["inputs"]
+    inputs = again.kept("unseen_layouts", f"{TASK}-SafeMR-seed0")[1]["inputs"]
     evaluate.measured(
         again.measurements, again.record(inputs), episodes=inputs["episodes"], seed=inputs["seed"]
     )
@@ -151,6 +153,33 @@ CASES: Mapping[Callable[[Again], None], tuple[Path, tuple[str, ...]]] = {
 }
 
 
+CLOSE = 1e-6
+FIRST_STEPS = 3
+# Kind -> pattern of the place of a number -> by how much it may differ, absolutely below 1.
+TOLERANCE: Mapping[str, Mapping[str, float]] = {
+    # Eight episodes of a thousand steps, few of which violate.
+    "certificates": {r"/row/policy_\w+_share": 0.02},
+    # A hundred episodes: four standard errors of a return (sd 8 of 18), of a share.
+    "unseen_layouts": {
+        "/(return|goals|reward_approach|reward_goal)": 0.25, "/return_sd": 0.3, "/length": CLOSE,
+        "/zero_violation_share": 0.2, "/violation_rate": 0.02, "/cost.*": 5.0,
+    },
+    # Ten thousand flights, or two thousand.
+    "aircraft_learners": {"/(collisions|collision_share|effort.*|least_separation)": 0.01},
+    "aircraft_neural": {
+        # The control is trained by what is measured, for thousands of steps.
+        r"\[\d+\]/(collisions|\w*share\w*|effort.*|least_separation|volume.*|iou)": 0.02,
+    },
+    "aircraft_neural_slice": {"/learned/.*": 1e-4},
+    "rollouts": {"/map/(multiplier|phi)": 1e-4},
+}  # fmt: skip
+
+
+def allowed(kind: str, place: str) -> float:
+    patterns = TOLERANCE.get(kind, {}).items()
+    return next((limit for pattern, limit in patterns if re.fullmatch(pattern, place)), CLOSE)
+
+
 def differences(now: Any, before: Any, place: str = "") -> list[tuple[str, float]]:
     """Every number's place and difference, relative where it is above 1; inf where not alike."""
     if isinstance(before, dict):
@@ -178,9 +207,15 @@ def differences(now: Any, before: Any, place: str = "") -> list[tuple[str, float
 
 
 def content(path: Path) -> Any:
+    """What was measured; of flown courses their shapes and the first steps."""
     if path.suffix == ".json":
         return json.loads(path.read_text())["value"]
-    return {name: values for name, values in data.load(path).items() if name != HEADER}
+    arrays = {name: values for name, values in data.load(path).items() if name != HEADER}
+    for name in ("robot", "goal", "box", "reward", "cost_indicator", "goal_met"):
+        whole = arrays.pop(f"episodes/{name}", None)
+        if whole is not None:
+            arrays |= {name: whole[:FIRST_STEPS], f"{name}, shape": np.array(whole.shape)}
+    return arrays
 
 
 def test_every_kind_is_measured_again_by_some_case() -> None:
@@ -207,5 +242,5 @@ def test_the_repository_keeps_what_its_code_measures(
         kept = recorded / measurements.FOLDER / kind / path.name
         assert kept.exists(), f"{kind}: inputs or version are others than those kept: redraw"
         found = differences(content(path), content(kept))
-        far = [(place, gap) for place, gap in found if gap > 0]
-        print(kind, len(found), sorted(far, key=lambda x: -x[1])[:12])
+        far = [(place, gap) for place, gap in found if gap > allowed(kind, place)]
+        assert not far, f"raise VERSIONS[{kind!r}] and redraw; or is it the processor? {far[:9]}"
