@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from safemr import records, statistics, tables
+from safemr import compute, records, statistics, tables
 from safemr.config import load
 from safemr.plotting import curves
 from safemr.runs import resolve
@@ -156,8 +156,8 @@ def computed(root: Path) -> tuple[tables.Table, pd.DataFrame]:
     minutes = statistics.core_minutes(progress, again)
     returns = statistics.learning_curves(progress, "eval_return")
     curves.compute_curves(returns, minutes, ["Pillars-0.15-Goal"])
-    table = tables.compute(again)
-    pd.testing.assert_frame_equal(tables.compute(runs).display, table.display)
+    table = compute.table(again)
+    pd.testing.assert_frame_equal(compute.table(runs).display, table.display)
     return table, minutes
 
 
@@ -169,9 +169,7 @@ def test_a_record_that_does_not_say_what_it_cost_has_dashes(record):
     assert (row["core-minutes a run"], row["steps a core-second"], row["peak MB"]) == ("–",) * 3
     assert "0.0 core-hours" in table.caption
     assert "no record names its processor" in table.caption
-    assert table.notes == [
-        "Records that do not say their processor time: CEM on Pillars-0.15-Goal (1 of 1)."
-    ]
+    assert table.notes == ["Records that do not say their processor time: CEM on Short (1 of 1)."]
     for text in (table.markdown(), table.latex()):
         assert "inf" not in text
         assert "nan" not in text

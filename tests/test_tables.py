@@ -8,7 +8,7 @@ import pytest
 from sample_scores import OTHER, RETURNS, TASK, expected_runs, score_rows
 from scipy import stats
 
-from safemr import comparisons, reference, sensitivity, statistics, tables
+from safemr import comparisons, compute, reference, sensitivity, statistics, tables
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def test_compute_adds_up_the_processor_time():
          "steps": [400_000, 400_000, 2_000_000], "cpu_s": [100.0, 140.0, 400.0],
          "wall_s": [110.0, 300.0, 420.0], "peak_rss_mb": [500.0, 510.0, 400.0], "cpu": "a"}
     )  # fmt: skip
-    table = tables.compute(runs)
+    table = compute.table(runs)
     header, _, *rows = cells(table)
     assert [dict(zip(header, row, strict=True))["core-minutes a run"] for row in rows] == [
         "2.0",

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import comparisons, statistics, tables
+from safemr import comparisons, compute, statistics, tables
 
 given, params = snakemake.input, snakemake.params
 learned = pd.read_csv(given.scores)
@@ -20,7 +20,7 @@ made = [
     ),
     tables.full_results(scores, missing=missing, rule=rule, layouts=params.layouts),
     comparisons.differences(learned, missing=missing),
-    tables.compute(runs),
+    compute.table(runs),
 ]
 if params.push:
     made.append(tables.push_split(scores, params.push, missing=missing))
