@@ -7,12 +7,12 @@ import functools
 from collections.abc import Mapping
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.layout import Layout
 from envs.navigation_kernels import kinematics, read_states, write_controls
+from envs.simulator import mujoco
 from envs.tasks import NavigationTask
 
 FRAME_SKIP = 10  # MuJoCo steps of 0.002 s in one environment step
