@@ -6,9 +6,9 @@
     python3 make.py lock               renew requirements.lock from pyproject.toml
 
 The environment is .venv, or the folder that SAFEMR_VENV names; where the path of this repository
-holds spaces or quotes, a folder in the user's cache (~/.cache/safemr). It is built on first use from
-requirements.lock, and built again when that file or the Python version changes, or when building
-it was interrupted.
+holds spaces or quotes, a folder in the user's cache (~/.cache/safemr). It is built on first use
+from requirements.lock, and built again when that file or the Python version changes, or when
+building it was interrupted.
 """
 
 from __future__ import annotations

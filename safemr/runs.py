@@ -26,6 +26,7 @@ from safemr.config import FAMILIES, Config, Variant, unknown
 from safemr.errors import UserError
 from safemr.strict_yaml import show
 
+
 @dataclass(frozen=True)
 class Run:
     """One training run: where it stands in figures (task, variant, seed), and its config."""
