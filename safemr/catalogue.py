@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from safemr.config import FAMILIES
+from safemr.environments import register_tasks
 from safemr.errors import UserError
 from safemr.hyperparameters import unused
 from safemr.names import unknown
@@ -49,6 +50,7 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
     """Import an algorithm by name and check the module's contract."""
     if name not in algorithm_names():
         raise unknown("algorithm", name, algorithm_names(), where)
+    register_tasks()  # an algorithm may import from that package
     file = f"safemr/algorithms/{name}.py"
     try:
         module = importlib.import_module(f"safemr.algorithms.{name}")

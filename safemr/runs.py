@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr import records, reference
+from safemr import environments, records, reference
 from safemr.catalogue import Algorithm, hyperparameters, load_algorithm
 from safemr.catalogue import algorithm_names as algorithm_names
 from safemr.config import Config, Variant
@@ -34,8 +34,6 @@ from safemr.tasks import (
     traits,
 )
 from safemr.tasks import Task as TaskOrName
-
-_ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
 
 
 @dataclass(frozen=True)
@@ -93,11 +91,11 @@ class Plan:
 def task_names() -> list[str]:
     """The tasks that the environment package registers, by their names without ``-v0``."""
     gymnasium = importlib.import_module("gymnasium")
-    importlib.import_module(_ENVIRONMENTS)
+    environments.register_tasks()
 
     def ours(entry_point: Any) -> bool:
         module = entry_point if isinstance(entry_point, str) else entry_point.__module__
-        return module.partition(":")[0].partition(".")[0] == _ENVIRONMENTS
+        return module.partition(":")[0].partition(".")[0] == environments.PACKAGE
 
     specs = gymnasium.registry.values()
     return sorted(spec.id.removesuffix("-v0") for spec in specs if ours(spec.entry_point))

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from safemr.environments import register_tasks
+
 # The ``task`` entry of a run's config (`safemr.runs.describe_task`), or the name of a registered
 # task, which then has its own settings.
 Task: TypeAlias = "str | Mapping[str, Any]"
@@ -64,8 +66,9 @@ def make_envs(task: Task, num_envs: int) -> Any:
     """A batched environment of a task."""
     import gymnasium
 
+    register_tasks()
     return gymnasium.make_vec(
-        f"envs:{base_of(task)}-v0",
+        f"{base_of(task)}-v0",
         num_envs,
         vectorization_mode="vector_entry_point",
         **settings_of(task),

@@ -170,7 +170,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         text = arguments.resolved
         try:
             if not text.lstrip().startswith("{"):
-                text = Path(text).read_text()
+                text = Path(text).read_text(encoding="utf-8")
             config = json.loads(text)
             name = config["algorithm"]["name"]
         except (OSError, ValueError, KeyError, TypeError) as error:
