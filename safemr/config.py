@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,23 @@ from typing import Any
 from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
 from safemr.errors import UserError
 from safemr.names import unknown
+from safemr.sections import (
+    LARGEST_SEED,
+    Section,
+    distinct,
+    flag,
+    integer,
+    labelled,
+    listed,
+    mapping,
+    name_in,
+    number,
+    seeds_in,
+)
 from safemr.strict_yaml import read_yaml, show, typed
 
 FAMILIES = ("off_policy", "on_policy")
 WANDB_MODES = ("disabled", "offline", "online")
-LARGEST_SEED = 2**31 - 1
-LARGEST_COUNT = 10**10
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
 _ROOT = re.compile(r"(/|(\.\./)*)[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
 _REPOSITORY = Path(__file__).resolve().parents[1]
 _SOURCES = {
@@ -155,10 +165,10 @@ def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None
 
 def parse(raw: Any) -> Config:
     """Check structure, types and ranges of a configuration and return it."""
-    top = _Section(raw, "the config", _TOP_LEVEL)
-    evaluation = _Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
-    wandb = _Section(top.get("wandb", {}), "wandb", ("mode", "project"))
-    safe = _Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
+    top = Section(raw, "the config", _TOP_LEVEL)
+    evaluation = Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
+    wandb = Section(top.get("wandb", {}), "wandb", ("mode", "project"))
+    safe = Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
     tasks = _tasks(top.required("tasks"), "tasks")
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
@@ -167,34 +177,34 @@ def parse(raw: Any) -> Config:
         tasks=tuple(tasks),
         task_variants={name: variant for name, variant in tasks.items() if variant},
         algorithms=_variants(top.required("algorithms"), "algorithms"),
-        seeds=_seeds(top.required("seeds"), "seeds"),
+        seeds=seeds_in(top.required("seeds"), "seeds"),
         budget=_budget(top.required("budget"), "budget"),
-        log_points=_integer(top.get("log_points", 50), "log_points", 1),
+        log_points=integer(top.get("log_points", 50), "log_points", 1),
         evaluation=Evaluation(
-            _integer(evaluation.required("points"), "evaluation.points", 1),
-            _integer(evaluation.required("episodes"), "evaluation.episodes", 1),
-            _integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
+            integer(evaluation.required("points"), "evaluation.points", 1),
+            integer(evaluation.required("episodes"), "evaluation.episodes", 1),
+            integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
         ),
         unseen_layouts=_unseen(top.get("unseen_layouts")),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
-            for name, value in _labelled(top.get("task_overrides", {}), "task_overrides")
+            for name, value in labelled(top.get("task_overrides", {}), "task_overrides")
         },
         sensitivity=_sensitivity(top.get("sensitivity"), top.required("seeds")),
         aircraft=_aircraft(top.get("aircraft"), top.required("seeds")),
         outside={
             label: _outside(value, f"outside.{label}")
-            for label, value in _labelled(top.get("outside", {}), "outside")
+            for label, value in labelled(top.get("outside", {}), "outside")
         },
         results_root=_root(top.get("results_root", "results"), "results_root"),
         figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
-        allow_missing=_flag(top.get("allow_missing", False), "allow_missing"),
+        allow_missing=flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
-        wandb_project=_name(wandb.get("project", "safemr"), "wandb.project"),
-        cost_tolerance=_number(
+        wandb_project=name_in(wandb.get("project", "safemr"), "wandb.project"),
+        cost_tolerance=number(
             safe.get("cost_tolerance", COST_TOLERANCE), "safe.cost_tolerance", 0, math.inf
         ),
-        zero_violation_share=_number(
+        zero_violation_share=number(
             safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
     )
@@ -226,65 +236,6 @@ _TOP_LEVEL = (
 )
 
 
-class _Section:
-    """A mapping with a fixed set of keys."""
-
-    def __init__(self, value: Any, where: str, known: Collection[str]) -> None:
-        self.where = where
-        self.value = _mapping(value, where)
-        for key in self.value:
-            if key not in known:
-                raise unknown("key", key, known, where)
-
-    def required(self, key: str) -> Any:
-        if key not in self.value:
-            raise UserError(f"{self.where} lacks {key!r}")
-        return self.value[key]
-
-    def get(self, key: str, default: Any = None) -> Any:
-        return self.value.get(key, default)
-
-
-def _mapping(value: Any, where: str) -> Mapping[str, Any]:
-    if not isinstance(value, Mapping):
-        raise UserError(f"{where} must be a mapping, not {show(value)}")
-    for key in value:
-        if not isinstance(key, str):
-            raise UserError(f"{where}: the key {show(key)} must be text; put it in quotes")
-    return value
-
-
-def _labelled(value: Any, where: str) -> list[tuple[str, Any]]:
-    items = [
-        (_name(key, f"a name in {where}"), item) for key, item in _mapping(value, where).items()
-    ]
-    _distinct([key.lower() for key, _ in items], where)
-    return items
-
-
-def _list(value: Any, where: str) -> list[Any]:
-    if not isinstance(value, (list, tuple)):
-        raise UserError(f"{where} must be a list, not {show(value)}")
-    if not value:
-        raise UserError(f"{where} is empty")
-    return list(value)
-
-
-def _distinct(items: Sequence[Any], where: str) -> None:
-    for index, item in enumerate(items):
-        if item in items[:index]:
-            raise UserError(f"{where} names {show(item)} twice")
-
-
-def _name(value: Any, where: str) -> str:
-    if not isinstance(value, str) or not _NAME.fullmatch(value):
-        raise UserError(
-            f"{where} must consist of letters, digits and . _ + - (60 at most, not beginning with "
-            f"a sign), not {show(value)}"
-        )
-    return value
-
-
 def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
     """Names of tasks, and what each is where it is no registered one.
 
@@ -297,15 +248,15 @@ def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
         if not entries:
             raise UserError(f"{where} is empty")
     else:
-        for item in _list(value, where):
+        for item in listed(value, where):
             if isinstance(item, Mapping) and len(item) != 1:
                 raise UserError(
                     f"each of {where} must be a name or one NAME: {{base, settings}}, "
                     f"not {show(item)}"
                 )
             entries += item.items() if isinstance(item, Mapping) else [(item, None)]
-    names = [_name(name, f"each of {where}") for name, _ in entries]
-    _distinct([name.lower() for name in names], where)
+    names = [name_in(name, f"each of {where}") for name, _ in entries]
+    distinct([name.lower() for name in names], where)
     return {
         name: _task_variant(entry, f"{where}.{name}")
         for name, (_, entry) in zip(names, entries, strict=True)
@@ -315,10 +266,10 @@ def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
 def _task_variant(value: Any, where: str) -> TaskVariant | None:
     if value is None or value == {}:
         return None
-    section = _Section(value, where, ("base", "settings"))
+    section = Section(value, where, ("base", "settings"))
     return TaskVariant(
-        _name(section.required("base"), f"{where}.base"),
-        _mapping(section.required("settings"), f"{where}.settings"),
+        name_in(section.required("base"), f"{where}.base"),
+        mapping(section.required("settings"), f"{where}.settings"),
     )
 
 
@@ -328,53 +279,24 @@ def task_name(value: Any, where: str) -> str:
     Raises:
         UserError: for anything else.
     """
-    return _name(value, where)
-
-
-def _integer(value: Any, where: str, low: int, high: int = LARGEST_COUNT) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise UserError(f"{where} must be an integer, not {show(value)}")
-    if not low <= value <= high:
-        raise UserError(f"{where} = {show(value)} must lie in [{low}, {high}]")
-    return value
-
-
-def _flag(value: Any, where: str) -> bool:
-    if not isinstance(value, bool):
-        raise UserError(f"{where} must be true or false, not {show(value)}")
-    return value
-
-
-def _number(value: Any, where: str, low: float = -math.inf, high: float = math.inf) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise UserError(f"{where} must be a number, not {show(value)}")
-    if not low <= value <= high or not abs(value) < 1e300:
-        raise UserError(f"{where} = {show(value)} must be finite and lie in [{low:g}, {high:g}]")
-    return float(value)
-
-
-def _seeds(value: Any, where: str) -> tuple[int, ...]:
-    items = _list(value, where)
-    seeds = tuple(_integer(item, f"each of {where}", 0, LARGEST_SEED) for item in items)
-    _distinct(seeds, where)
-    return seeds
+    return name_in(value, where)
 
 
 def _budget(value: Any, where: str) -> dict[str, int]:
-    budget = _Section(value, where, FAMILIES).value
-    return {name: _integer(steps, f"{where}.{name}", 1) for name, steps in budget.items()}
+    budget = Section(value, where, FAMILIES).value
+    return {name: integer(steps, f"{where}.{name}", 1) for name, steps in budget.items()}
 
 
 def _variants(value: Any, where: str) -> dict[str, Variant]:
     variants = {}
-    for label, entry in _labelled(value, where):
-        settings = dict(_mapping(entry, f"{where}.{label}"))
+    for label, entry in labelled(value, where):
+        settings = dict(mapping(entry, f"{where}.{label}"))
         if "algorithm" not in settings:
             near = difflib.get_close_matches("algorithm", settings, n=1)
             hint = f"; did you mean it by {near[0]!r}?" if near else ""
             raise UserError(f"{where}.{label} lacks 'algorithm'{hint}")
         variants[label] = Variant(
-            _name(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
+            name_in(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
         )
     if not variants:
         raise UserError(f"{where} is empty")
@@ -382,13 +304,13 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
 
 
 def _task_overrides(value: Any, where: str) -> TaskOverrides:
-    section = _Section(value, where, ("settings", "budget", "hyperparameters"))
-    families = _Section(section.get("hyperparameters", {}), f"{where}.hyperparameters", FAMILIES)
+    section = Section(value, where, ("settings", "budget", "hyperparameters"))
+    families = Section(section.get("hyperparameters", {}), f"{where}.hyperparameters", FAMILIES)
     return TaskOverrides(
-        _mapping(section.get("settings", {}), f"{where}.settings"),
+        mapping(section.get("settings", {}), f"{where}.settings"),
         _budget(section.get("budget", {}), f"{where}.budget"),
         {
-            family: _mapping(values, f"{where}.hyperparameters.{family}")
+            family: mapping(values, f"{where}.hyperparameters.{family}")
             for family, values in families.value.items()
         },
     )
@@ -397,50 +319,50 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
 def _unseen(value: Any) -> UnseenLayouts | None:
     if not value and (value is None or isinstance(value, Mapping)):
         return None
-    section = _Section(value, "unseen_layouts", ("episodes", "seed"))
+    section = Section(value, "unseen_layouts", ("episodes", "seed"))
     return UnseenLayouts(
-        _integer(section.required("episodes"), "unseen_layouts.episodes", 1),
-        _integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
+        integer(section.required("episodes"), "unseen_layouts.episodes", 1),
+        integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
     )
 
 
 def _sensitivity(value: Any, seeds: Any) -> Sensitivity | None:
     if not value and (value is None or isinstance(value, Mapping)):
         return None
-    section = _Section(value, "sensitivity", ("task", "algorithm", "points", "seeds"))
+    section = Section(value, "sensitivity", ("task", "algorithm", "points", "seeds"))
     points = []
-    for point in _list(section.required("points"), "sensitivity.points"):
+    for point in listed(section.required("points"), "sensitivity.points"):
         if not isinstance(point, (list, tuple)) or len(point) != 2:
             raise UserError(f"each of sensitivity.points must be a pair [a, b], not {show(point)}")
-        a, b = (_number(x, "each number of sensitivity.points", 0) for x in point)
+        a, b = (number(x, "each number of sensitivity.points", 0) for x in point)
         points.append((a, b))
-    _distinct(points, "sensitivity.points")
+    distinct(points, "sensitivity.points")
     return Sensitivity(
-        _name(section.required("task"), "sensitivity.task"),
-        _name(section.required("algorithm"), "sensitivity.algorithm"),
+        name_in(section.required("task"), "sensitivity.task"),
+        name_in(section.required("algorithm"), "sensitivity.algorithm"),
         tuple(points),
-        _seeds(section.get("seeds", seeds), "sensitivity.seeds"),
+        seeds_in(section.get("seeds", seeds), "sensitivity.seeds"),
     )
 
 
 def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
     if not value and (value is None or isinstance(value, Mapping)):
         return None
-    section = _Section(value, "aircraft", ("task", "algorithms", "seeds"))
+    section = Section(value, "aircraft", ("task", "algorithms", "seeds"))
     return Aircraft(
-        _name(section.get("task", "Aircraft"), "aircraft.task"),
+        name_in(section.get("task", "Aircraft"), "aircraft.task"),
         _variants(section.required("algorithms"), "aircraft.algorithms"),
-        _seeds(section.get("seeds", seeds), "aircraft.seeds"),
+        seeds_in(section.get("seeds", seeds), "aircraft.seeds"),
     )
 
 
 def _outside(value: Any, where: str) -> Outside:
-    section = _Section(value, where, ("algorithm", "version", "steps", "hyperparameters"))
+    section = Section(value, where, ("algorithm", "version", "steps", "hyperparameters"))
     return Outside(
-        _name(section.required("algorithm"), f"{where}.algorithm"),
-        _integer(section.get("version", 1), f"{where}.version", 1),
-        _integer(section.required("steps"), f"{where}.steps", 1),
-        _mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),
+        name_in(section.required("algorithm"), f"{where}.algorithm"),
+        integer(section.get("version", 1), f"{where}.version", 1),
+        integer(section.required("steps"), f"{where}.steps", 1),
+        mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),
     )
 
 
