@@ -226,8 +226,10 @@ def checked_limit(name: str, given: Any, registered: int) -> int:
     """Steps of an episode; None stands for the registered limit, as in `gymnasium.make`."""
     if given is None:
         return registered
-    if isinstance(given, bool) or not isinstance(given, int) or given < 1:
-        raise ValueError(f"{name}: max_episode_steps must be a positive integer, got {given!r}")
+    if isinstance(given, bool) or not isinstance(given, int) or not 1 <= given < NO_LIMIT:
+        raise ValueError(
+            f"{name}: max_episode_steps must be a positive integer below 2**63, got {given!r}"
+        )
     return given
 
 

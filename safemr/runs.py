@@ -109,6 +109,8 @@ def _task_version(name: str, settings_json: str) -> int:
     for setting in settings:  # before Gymnasium sees them: it has keywords of its own, as `task`
         if setting not in known:
             raise unknown("setting", setting, known, f"task {name}")
+        if settings[setting] is None:
+            raise UserError(f"task {name}: the setting {setting} has no value; leave it out")
     try:  # a batch, since that is what learners train on
         environment = gymnasium.make_vec(
             f"{name}-v0", vectorization_mode="vector_entry_point", **settings

@@ -165,6 +165,9 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
         *NOT_A_MAPPING,
         *({"sleeep": True}, {"sleep": "yes"}, {"sleep": 1}, {"num_obstacles": 0}, {"name": "x"}),
         *({"obstacle_size": -1.0}, {"obstacle_size": math.nan}, {"extent": datetime.date.today()}),
+        *({"max_episode_steps": steps} for steps in (*NOT_POSITIVE, None)),
+        # Keywords of Gymnasium, not settings: the first one would train another task.
+        *({"task": "Pillars-0.15-Goal"}, {"render_mode": "rgb_array"}, {"num_envs": 4}),
     ],
     ("task_overrides", "Hazards-0.15-Push", "budget"): [
         *(*NOT_A_MAPPING, {"off": 1}, {"on_policy": 0}),

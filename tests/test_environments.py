@@ -725,3 +725,24 @@ def test_frames_of_a_batch_are_those_of_scalar_environments(
     for env in (batch, scalars[0]):
         for way in WAYS.values():
             assert_equal(way(env).render(), env.render())
+
+
+def test_a_frame_shows_the_present_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A goal that was met has moved since MuJoCo computed where things stand."""
+    monkeypatch.setattr(rendering, "_open", Camera)
+    env = make_scalar("Pillars-0.15-Goal-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    state = env.get_state()
+    state["worlds"]["goal"][0] = state["worlds"]["start"][0, :2] + 0.2
+    env.set_state(state)
+    *_, info = env.step(np.zeros(2, np.float32))
+    assert info["goal_met"]
+    shown = env.render()[:, :2]
+    assert (np.abs(shown - env.scene().goal) < 1e-9).all(axis=1).any()
+
+
+def test_other_turn_is_a_number() -> None:
+    for bad in ("1.0", True, None, [1.0], np.nan):
+        for kind in KINDS:
+            with pytest.raises(ValueError, match="other_turn"):
+                make("Aircraft-v0", kind, other_turn=bad)
