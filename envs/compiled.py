@@ -50,7 +50,8 @@ def _find_cache(sources: Path) -> bool:
     if not (_is_ours_alone(own) and _is_writable(own)):
         return False
     # Both: Numba reads the variable at import, and now and then again.
-    os.environ[VARIABLE] = numba.config.CACHE_DIR = str(own)
+    os.environ[VARIABLE] = str(own)
+    numba.config.CACHE_DIR = str(own)  # type: ignore[attr-defined]
     return True
 
 

@@ -451,7 +451,7 @@ def test_many_kills_of_snakemake(number: int, checkout: Checkout) -> None:
 @pytest.fixture
 def odd(tmp_path: Path) -> Checkout:
     """A checkout in a path that needs quotes."""
-    folder = tmp_path / "it's \"a\" $HOME é\\d"
+    folder = tmp_path / 'it\'s "a" $HOME é\\d'
     folder.mkdir()
     copy = Checkout(folder)
     copy.configure()
