@@ -16,6 +16,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
+from envs.compiled import njit
 from envs.tasks import LIDAR_BINS
 
 BIN_WIDTH = 2 * math.pi / LIDAR_BINS
@@ -46,12 +47,12 @@ def _as_pointer(typing_context, address):
     return types.CPointer(types.float64)(address), generate
 
 
-@numba.njit(cache=True)
+@njit()
 def _array_at(address, length):
     return numba.carray(_as_pointer(address), (length,))  # type: ignore[call-arg]
 
 
-@numba.njit(cache=True)
+@njit()
 def write_controls(addresses, actions):
     """Copy actions [N, 2], clipped to [-1, 1], into MuJoCo's ctrl, whose addresses are column 3.
 
@@ -67,7 +68,7 @@ def write_controls(addresses, actions):
     return -1
 
 
-@numba.njit(cache=True)
+@njit()
 def read_states(addresses, qpos, qvel, qacc, diverged):
     """Copy MuJoCo's qpos, qvel and qacc (addresses [N, 4], columns 0 to 2) into the stacks.
 
@@ -88,7 +89,7 @@ def read_states(addresses, qpos, qvel, qacc, diverged):
             qacc[i] = new_qacc
 
 
-@numba.njit(cache=True)
+@njit()
 def kinematics(qpos, qvel, start, obstacles, pose, velocity, d, d_dot, reach, near):
     """World pose and velocity of the robot, distance and rate (positive: away) to each obstacle.
 
@@ -120,7 +121,7 @@ def kinematics(qpos, qvel, start, obstacles, pose, velocity, d, d_dot, reach, ne
     return count
 
 
-@numba.njit(cache=True)
+@njit()
 def task_distances(pose, qpos, goal, has_box, distances):
     """The distances whose decrease is rewarded: approach and push.
 
@@ -140,7 +141,7 @@ def task_distances(pose, qpos, goal, has_box, distances):
             distances[i, 1] = 0.0
 
 
-@numba.njit(cache=True)
+@njit()
 def score(
     before,
     after,
@@ -186,7 +187,7 @@ def score(
         scores[6, i] = contact
 
 
-@numba.njit(cache=True)
+@njit()
 def _add_to_lidar(bins, pose, c, s, x, y, lidar_range):
     """Safety Gym's pseudo lidar for one point: its signal into its bin and, aliased, beside.
 
@@ -208,7 +209,7 @@ def _add_to_lidar(bins, pose, c, s, x, y, lidar_range):
     bins[before] = max(bins[before], (1.0 - fraction) * signal)
 
 
-@numba.njit(cache=True)
+@njit()
 def observe(pose, qpos, qvel, qacc, obstacles, goal, blocks, lidar_range, observation):
     """The flat observation [N, obs] (zeros on entry), in closed form from the state.
 

@@ -7,14 +7,15 @@ import functools
 from collections.abc import Mapping
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.layout import Layout
 from envs.navigation_kernels import kinematics, read_states, write_controls
+from envs.simulator import mujoco
 from envs.tasks import NavigationTask
 
+ASSETS = Path(__file__).parent / "assets"
 FRAME_SKIP = 10  # MuJoCo steps of 0.002 s in one environment step
 ROBOT_REACH = 0.16  # m, the corners of the nose are 0.158 m from the robot's origin
 
@@ -23,7 +24,10 @@ Array = NDArray[np.float64]
 
 @functools.lru_cache(maxsize=8)
 def _compile(task: NavigationTask) -> mujoco.MjModel:
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).parent / "assets" / f"{task.family}.xml"))
+    # Read here: to MuJoCo a backslash in a path is a separator, whatever the system.
+    files = {path.name: path.read_bytes() for path in ASSETS.glob("*.xml")}
+    text = files.pop(f"{task.family}.xml").decode()
+    spec = mujoco.MjSpec.from_string(text, include=files)
     template = spec.body("obstacle0")
     geom = template.geoms[0]
     geom.size = [task.obstacle_size, geom.size[1], 0.0]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.navigation_physics import Worlds
+from envs.simulator import OPENGL_FAULT, VARIABLE, mujoco
 
 SIZE = 480  # pixels
 
@@ -39,12 +41,13 @@ class FrameRenderer:
 
 def _open(model: Any) -> Any:
     try:
-        # MuJoCo chooses its OpenGL backend at import, by the variable MUJOCO_GL.
-        from mujoco import Renderer
-
-        return Renderer(model, SIZE, SIZE)
+        return mujoco.Renderer(model, SIZE, SIZE)
     except Exception as error:  # the backends raise whatever they like
+        value = os.environ.get(VARIABLE)
+        setting = f"{VARIABLE}={value}" if value else f"{VARIABLE} unset"
+        off = not hasattr(mujoco, "GLContext")
+        reason = OPENGL_FAULT or ("OpenGL is switched off" if off else " ".join(str(error).split()))
         raise RuntimeError(
-            f"cannot render: OpenGL is not available ({error}); set MUJOCO_GL=egl or osmesa on a "
+            f"cannot render with {setting}: {reason}; start with {VARIABLE}=egl or osmesa on a "
             "machine without display, or draw with envs.drawing.draw_scene, which needs no OpenGL"
         ) from error

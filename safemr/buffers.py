@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+
+from envs.compiled import njit
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -161,7 +162,7 @@ class Replay:
             table[: len(stored)] = stored
 
 
-@numba.njit(cache=True)
+@njit()
 def _follow(
     flat: Rows,
     first: int,

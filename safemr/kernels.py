@@ -17,11 +17,11 @@ import ctypes
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cython_blas
 
+from envs.compiled import njit
 from safemr.networks import ACTIVATIONS, LOG_STD_MAX, LOG_STD_MIN
 
 Floats = NDArray[np.float32]
@@ -29,9 +29,7 @@ Scalar = Any  # float32 when compiled
 
 # Sums may be reordered, so that they vectorise; NaN and infinity keep their meaning, because
 # diverged training is recognised by them.
-_compiled = numba.njit(
-    cache=True, error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"}
-)
+_compiled = njit(error_model="numpy", fastmath={"reassoc", "contract", "arcp", "nsz"})
 
 _RELU, _ELU = ACTIVATIONS.index("relu"), ACTIVATIONS.index("elu")
 # A Python float would turn the loops into double precision.

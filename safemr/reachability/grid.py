@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from envs.compiled import njit
 
 Floats = NDArray[np.float64]
 
@@ -74,7 +75,7 @@ class Grid:
         return {"x": list(self.x_range), "y": list(self.y_range), "shape": list(self.shape)}
 
 
-@numba.njit(cache=True)
+@njit()
 def _trilinear(
     values: NDArray[np.float32], states: Floats, low: Floats, spacing: Floats
 ) -> Floats:  # pragma: no cover - compiled

@@ -26,11 +26,11 @@ import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from envs.aircraft import AircraftDynamics
+from envs.compiled import njit
 from safemr.errors import UserError
 from safemr.reachability.grid import Floats, Grid
 
@@ -191,7 +191,7 @@ def _moves(
     )
 
 
-@numba.njit(cache=True)
+@njit()
 def _sweep(
     value: NDArray[np.float32],
     following: NDArray[np.float32],
