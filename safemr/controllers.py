@@ -19,6 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from safemr import reference
+from safemr.environments import register_tasks
 from safemr.evaluate import evaluate
 from safemr.measurements import Measurements
 from safemr.point_robot import PointRobot
@@ -139,11 +140,12 @@ def controller_scores(
     A seed is one evaluation of `episodes` layouts of its own. settings: task -> settings of its
     environment. Tasks of other kinds give no rows.
     """
+    register_tasks()
     rows = []
     for task in tasks:
         for name, controller in CONTROLLERS.get(task.rsplit("-", 1)[-1], {}).items():
             envs = gymnasium.make_vec(
-                f"envs:{task}-v0", episodes, vectorization_mode="vector_entry_point",
+                f"{task}-v0", episodes, vectorization_mode="vector_entry_point",
                 **(settings or {}).get(task, {}),
             )  # fmt: skip
             for seed in seeds:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safemr.energy import constraint, energy, largest
+from safemr.environments import register_tasks
 from safemr.errors import UserError
 from safemr.evaluate import Acts
 from safemr.point_robot import PointRobot
@@ -200,8 +201,9 @@ def make_simulator(
     task: str, num_envs: int = 128, settings: Mapping[str, Any] | None = None
 ) -> Any:
     """The task's batched environment. Raises UserError for a task without the point robot."""
+    register_tasks()
     envs: Any = gymnasium.make_vec(
-        f"envs:{task}-v0", num_envs, vectorization_mode="vector_entry_point", **(settings or {})
+        f"{task}-v0", num_envs, vectorization_mode="vector_entry_point", **(settings or {})
     )
     if "velocimeter" not in envs.observation_layout:
         raise UserError(f"falsification needs a task of the point robot; {task} is none")

@@ -21,12 +21,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr import records
+from safemr import environments, records
 from safemr.config import FAMILIES, Config, Variant, unknown
 from safemr.errors import UserError
 from safemr.strict_yaml import show
-
-_ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
 
 
 @dataclass(frozen=True)
@@ -101,6 +99,7 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
     """Import an algorithm by name and check the module's contract."""
     if name not in algorithm_names():
         raise unknown("algorithm", name, algorithm_names(), where)
+    environments.register_tasks()  # an algorithm may import from that package
     file = f"safemr/algorithms/{name}.py"
     try:
         module = importlib.import_module(f"safemr.algorithms.{name}")
@@ -120,11 +119,11 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
 def task_names() -> list[str]:
     """The tasks that the environment package registers, by their names without ``-v0``."""
     gymnasium = importlib.import_module("gymnasium")
-    importlib.import_module(_ENVIRONMENTS)
+    environments.register_tasks()
 
     def ours(entry_point: Any) -> bool:
         module = entry_point if isinstance(entry_point, str) else entry_point.__module__
-        return module.partition(":")[0].partition(".")[0] == _ENVIRONMENTS
+        return module.partition(":")[0].partition(".")[0] == environments.PACKAGE
 
     specs = gymnasium.registry.values()
     return sorted(spec.id.removesuffix("-v0") for spec in specs if ours(spec.entry_point))

@@ -20,6 +20,7 @@ from typing import Any, TextIO
 from safemr import records, runs
 from safemr.checkpoints import CHECKPOINT, RunSession
 from safemr.config import WANDB_MODES
+from safemr.environments import register_tasks
 from safemr.errors import UserError, tell
 from safemr.strict_yaml import typed
 
@@ -28,8 +29,7 @@ def make_envs(task: Mapping[str, Any], num_envs: int) -> Any:
     """A batched environment of a run's task: the ``task`` entry of its config."""
     import gymnasium as gym
 
-    import envs  # noqa: F401  registers the tasks
-
+    register_tasks()
     return gym.make_vec(
         f"{task['name']}-v0",
         num_envs=num_envs,
@@ -177,7 +177,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         text = arguments.resolved
         try:
             if not text.lstrip().startswith("{"):
-                text = Path(text).read_text()
+                text = Path(text).read_text(encoding="utf-8")
             config = json.loads(text)
             name = config["algorithm"]["name"]
         except (OSError, ValueError, KeyError, TypeError) as error:
