@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
@@ -30,6 +31,8 @@ COMMANDS = {
 @contextlib.contextmanager
 def reported_errors() -> Iterator[None]:
     """Print a UserError as one line on standard error and exit with its status (2)."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a letter that the terminal lacks stops nothing
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         yield
     except UserError as error:
