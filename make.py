@@ -5,9 +5,10 @@
     python3 make.py run -- COMMAND     any command inside the environment
     python3 make.py lock               renew requirements.lock from pyproject.toml
 
-The environment is .venv, or the folder that SAFEMR_VENV names. It is built on first use from
-requirements.lock, and built again when that file or the Python version changes, or when building
-it was interrupted.
+The environment is .venv, or the folder that SAFEMR_VENV names; where the path of this repository
+holds spaces or quotes, a folder in the user's cache (~/.cache/safemr). It is built on first use
+from requirements.lock, and built again when that file or the Python version changes, or when
+building it was interrupted.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent
 LOCK = ROOT / "requirements.lock"
 STAMP = "complete"  # written last; holds the key of what the environment was built from
+AWAY = "; not in .venv: Snakemake cannot call an interpreter whose path needs quotes"
 HEADER = """\
 # Everything that the pipeline and the tests need, with exact versions.
 # Renewed by `python3 make.py lock` from pyproject.toml.
@@ -41,7 +43,8 @@ def main(arguments: Sequence[str]) -> int:
     if command == "lock" and not rest:
         return write_lock()
     if command == "all":
-        return check(rest) or run("python", "-m", "snakemake", "-j2", "--keep-going", "all", *rest)
+        command = ("snakemake", "-j2", "--keep-going", "all", *rest)
+        return check(rest) or run("python", "-P", "-m", *command)
     if command == "test":
         return run("python", "-m", "pytest", "-n", "2", "-m", "not slow", *rest)
     if command == "run" and rest and rest != ["--"]:
@@ -54,7 +57,9 @@ def run(*command: str) -> int:
     """Run a command in the environment, from the repository's root; returns its exit status."""
     folder = environment()
     path = os.pathsep.join([str(folder / "bin"), os.environ.get("PATH", os.defpath)])
-    variables = {**os.environ, "PATH": path, "VIRTUAL_ENV": str(folder)}
+    # What PYTHONPATH names would stand before the packages of the environment.
+    ours = {"PATH": path, "VIRTUAL_ENV": str(folder), "PYTHONPATH": str(ROOT), "PYTHONUTF8": "1"}
+    variables = {**os.environ, **ours}
     # One thread a process: the parallelism is over runs and test files.
     variables.setdefault("OMP_NUM_THREADS", "1")
     variables.pop("PYTHONHOME", None)
@@ -62,10 +67,12 @@ def run(*command: str) -> int:
     if program is None:
         print(f"error: there is no command {command[0]!r}", file=sys.stderr)
         return 127
-    try:
-        return subprocess.run([program, *command[1:]], cwd=ROOT, env=variables).returncode
-    except KeyboardInterrupt:
-        return 130
+    with home_for(folder) as homes:
+        variables.update(homes)
+        try:
+            return subprocess.run([program, *command[1:]], cwd=ROOT, env=variables).returncode
+        except KeyboardInterrupt:
+            return 130
 
 
 def check(arguments: Sequence[str]) -> int:
@@ -73,31 +80,104 @@ def check(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--configfile", "--configfiles", nargs="+", action="extend", default=[])
     files = parser.parse_known_args(arguments)[0].configfile
-    return run("python", "-m", "safemr.cli", "config", "config/config.yaml", *files) if files else 0
+    command = ("safemr.cli", "config", "config/config.yaml", *files)
+    return run("python", "-P", "-m", *command) if files else 0
 
 
 def environment() -> Path:
     """The folder of the complete environment, built if need be."""
-    folder = Path(os.environ.get("SAFEMR_VENV") or ROOT / ".venv").expanduser().absolute()
-    key = hashlib.sha256(LOCK.read_bytes() + f"{sys.version} {ROOT}".encode()).hexdigest()
+    folder = place()
+    key = hashlib.sha256(LOCK.read_bytes() + os.fsencode(f"{sys.version} {ROOT}")).hexdigest()
     stamp = folder / STAMP
+    if stamp.is_file() and stamp.read_text() == key:  # perhaps where nothing can be written
+        return folder
     with exclusive(folder.with_name(folder.name + ".lock")):
         if stamp.is_file() and stamp.read_text() == key:
             return folder
         if folder.is_dir() and any(folder.iterdir()) and not (folder / "pyvenv.cfg").is_file():
             sys.exit(f"error: {folder} is not a virtual environment; choose another SAFEMR_VENV")
-        print(f"Setting up {folder} (some minutes, once)", flush=True)
+        away = "" if folder.is_relative_to(ROOT) or os.environ.get("SAFEMR_VENV") else AWAY
+        print(f"Setting up {folder} (some minutes, once{away})", flush=True)
         create(folder)
-        pip(folder, "install", "--quiet", "-r", str(LOCK))
-        pip(folder, "install", "--quiet", "--no-deps", "--no-build-isolation", "-e", str(ROOT))
+        pip(folder, "install", "--quiet", "-r", LOCK.name)
+        pip(folder, "install", "--quiet", "--no-deps", "--no-build-isolation", "-e", ".")
         stamp.write_text(key)
     return folder
+
+
+def place() -> Path:
+    """The folder for the environment: one whose path Snakemake and PATH can hold.
+
+    Snakemake calls the interpreter without quotes, and PATH and PYTHONPATH are split at colons.
+    """
+    if os.pathsep in str(ROOT):
+        sys.exit(f"error: PYTHONPATH cannot hold {ROOT}: move it to a path without {os.pathsep!r}")
+    named = os.environ.get("SAFEMR_VENV")
+    try:
+        folder = Path(named or ROOT / ".venv").expanduser().absolute()
+    except RuntimeError as error:
+        sys.exit(f"error: SAFEMR_VENV is {named}: {error}")
+    if is_plain(folder):
+        return folder
+    caches = cache_folder()
+    elsewhere = caches and caches / "safemr" / hashlib.sha256(os.fsencode(ROOT)).hexdigest()[:16]
+    if not named and elsewhere and is_plain(elsewhere):
+        return elsewhere
+    sys.exit(
+        f"error: Snakemake cannot call an interpreter in {folder}: set SAFEMR_VENV to a folder "
+        "whose path has no spaces, quotes or other special characters"
+    )
+
+
+def is_plain(path: Path) -> bool:
+    """Whether a path means the same to a shell without quotes."""
+    return not re.search(r"[^\w@%+=,./-]", str(path))
+
+
+def cache_folder() -> Path | None:
+    """The user's folder for caches, where there is one that can be written to."""
+    home = os.path.expanduser("~")  # "~" itself for a user without a home
+    named = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(named) and not os.path.isdir(home):
+        return None
+    folder = Path(named if os.path.isabs(named) else os.path.join(home, ".cache"))
+    return folder if folder.is_absolute() and is_writable(folder) else None
+
+
+def is_writable(folder: Path) -> bool:
+    """Whether the folder exists, or can be made, and a file can be made in it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def home_for(folder: Path) -> Iterator[dict[str, str]]:
+    """Variables for programs that need a home and a place for caches, where the user has none."""
+    home = os.path.expanduser("~")
+    homeless = not (os.path.isabs(home) and os.path.isdir(home))
+    if cache_folder() and not homeless:
+        yield {}
+        return
+    with contextlib.ExitStack() as stack:
+        own = folder / "cache"
+        if not is_writable(own):  # an environment that somebody else made
+            own = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="safemr-")))
+        variables = {"HOME": str(own)} if homeless else {}
+        if not cache_folder():
+            variables["XDG_CACHE_HOME"] = str(own)
+            variables["MPLCONFIGDIR"] = str(own / "matplotlib")
+        yield variables
 
 
 @contextlib.contextmanager
 def exclusive(path: Path) -> Iterator[None]:
     """Only one process at a time builds an environment; a dead one holds nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if not is_writable(path.parent):
+        sys.exit(f"error: {path.parent} cannot be written to; name another folder by SAFEMR_VENV")
     with open(path, "w") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
         yield
@@ -111,8 +191,17 @@ def create(folder: Path) -> None:
 
 
 def pip(folder: Path, *arguments: str) -> str:
-    command = [str(folder / "bin" / "python"), "-m", "pip", "--disable-pip-version-check"]
-    done = subprocess.run([*command, *arguments], stdout=subprocess.PIPE, text=True)
+    # Isolated: what PYTHONPATH names would count as installed. Nothing may go to another folder.
+    command = [str(folder / "bin" / "python"), "-I", "-m", "pip", "--disable-pip-version-check"]
+    elsewhere = {f"PIP_{name}" for name in ("TARGET", "PREFIX", "ROOT", "DRY_RUN")} | {"PYTHONPATH"}
+    variables = {name: value for name, value in os.environ.items() if name not in elsewhere}
+    done = subprocess.run(
+        [*command, *arguments],
+        cwd=ROOT,
+        env={**variables, "PIP_USER": "0"},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     if done.returncode:
         print(done.stdout, file=sys.stderr)
         sys.exit(f"error: pip {arguments[0]} failed; the next call starts again")

@@ -1,9 +1,12 @@
-"""make.py: what is wrong with a configuration file is said before Snakemake starts."""
+"""make.py: where the environment lies, and what is wrong is said before Snakemake starts."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import sys
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -64,6 +67,179 @@ def test_everything_else_is_left_to_snakemake(
     monkeypatch.setattr(make, "run", lambda *command: commands.append(command) or 0)
     assert make.main(["all", "--config", "seeds=[1]", "-n"]) == 0
     assert make.main(["all", "--configfile=config/smoke.yaml"]) == 0
-    assert [command[2] for command in commands] == ["snakemake", "safemr.cli", "snakemake"]
+    assert [command[3] for command in commands] == ["snakemake", "safemr.cli", "snakemake"]
     assert commands[0][-3:] == ("--config", "seeds=[1]", "-n")
     assert commands[1][-1] == "config/smoke.yaml"
+
+
+@pytest.fixture
+def repository(
+    make: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[str], Path]:
+    """A function that puts make.py into a new folder, where building is only written down."""
+    monkeypatch.undo()
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("SAFEMR_VENV", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def move(name: str) -> Path:
+        root = tmp_path / name
+        root.mkdir(parents=True)
+        (root / "requirements.lock").write_text("numpy\n")
+        monkeypatch.setattr(make, "ROOT", root)
+        monkeypatch.setattr(make, "LOCK", root / "requirements.lock")
+        monkeypatch.setattr(make, "create", lambda folder: folder.mkdir(parents=True))
+        monkeypatch.setattr(make, "pip", lambda *arguments: "")
+        return root
+
+    return move
+
+
+def test_the_environment_lies_in_the_repository(
+    make: ModuleType, repository: Callable[[str], Path]
+) -> None:
+    root = repository("plain/données")
+    assert make.environment() == root / ".venv"
+
+
+@pytest.mark.parametrize("name", ["a b", "it's", 'a"b', "$HOME", "a\\b", "a;b", "~a"])
+def test_a_path_that_needs_quotes_has_its_environment_in_the_cache(
+    name: str,
+    make: ModuleType,
+    repository: Callable[[str], Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    repository(name)
+    folder = make.environment()
+    assert folder.parent == tmp_path / ".cache/safemr"
+    (line,) = capsys.readouterr().out.splitlines()
+    assert line.startswith(f"Setting up {folder} ")
+    assert make.environment() == folder
+    repository(f"{name}/another")
+    assert make.environment() not in (folder, None)
+
+
+@pytest.mark.parametrize(
+    ("name", "variables", "expected"),
+    [
+        ("a:b", {}, "move it to a path without ':'"),
+        ("a", {"SAFEMR_VENV": "/tmp/a b"}, "set SAFEMR_VENV to a folder whose path has no spaces"),
+        ("a b", {"HOME": "/dev/null"}, "set SAFEMR_VENV to a folder whose path has no spaces"),
+        ("a", {"SAFEMR_VENV": "/dev/null/a/b"}, "/dev/null/a cannot be written to; name another"),
+        ("a", {"SAFEMR_VENV": "~nobody-of-that-name/a"}, "SAFEMR_VENV is ~nobody-of-that-name/a"),
+    ],
+)
+def test_what_cannot_be_an_environment_is_one_line(
+    name: str,
+    variables: dict[str, str],
+    expected: str,
+    make: ModuleType,
+    repository: Callable[[str], Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    repository(name)
+    for variable, value in variables.items():
+        monkeypatch.setenv(variable, value)
+    with pytest.raises(SystemExit) as caught:
+        make.environment()
+    assert str(caught.value).startswith("error: ")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_complete_environment_is_used_where_nothing_can_be_written(
+    make: ModuleType, repository: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repository("a")
+    folder = make.environment()
+
+    def refused(path: Path) -> None:
+        raise PermissionError(path)
+
+    monkeypatch.setattr(make, "exclusive", refused)
+    assert make.environment() == folder
+
+
+SHOW = "import json, os; print(json.dumps({n: os.environ.get(n) for n in NAMES}))"
+
+
+def variables_of(make: ModuleType, capfd: pytest.CaptureFixture[str], *names: str) -> list[str]:
+    """What a command of make.py finds in its environment variables."""
+    assert make.run("python", "-c", f"NAMES = {names}; {SHOW}") == 0
+    return list(json.loads(capfd.readouterr().out).values())
+
+
+HOMES = ("HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR")
+
+
+def test_a_home_is_left_alone(
+    make: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in HOMES[1:]:
+        monkeypatch.delenv(name, raising=False)
+    assert variables_of(make, capfd, *HOMES) == [str(tmp_path), None, None]
+
+
+@pytest.mark.parametrize("place", ["environment", "temporary folder"])
+@pytest.mark.parametrize("home", ["missing", "no place for a cache"])
+def test_caches_have_a_place_without_a_home(
+    home: str,
+    place: str,
+    make: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    environment = tmp_path / "environment"
+    environment.mkdir()
+    (environment / "bin").symlink_to(Path(sys.prefix, "bin"))
+    monkeypatch.setattr(make, "environment", lambda: environment)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    if place == "temporary folder":  # somebody else's environment: a file is in the way
+        (environment / "cache").touch()
+    own = tmp_path / "home"
+    if home != "missing":
+        own.mkdir()
+        (own / ".cache").touch()
+    monkeypatch.setenv("HOME", str(own))
+    for name in HOMES[1:]:
+        monkeypatch.delenv(name, raising=False)
+    found, caches, drawing = map(Path, variables_of(make, capfd, *HOMES))
+    assert found == (caches if home == "missing" else own)
+    assert drawing == caches / "matplotlib"
+    if place == "environment":
+        assert caches == environment / "cache"
+    else:
+        assert caches.parent == tmp_path
+        assert not caches.exists()  # gone with the command
+
+
+def test_other_packages_do_not_come_before_the_environment(
+    make: ModuleType, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", "/opt/others")
+    monkeypatch.setenv("PYTHONHOME", "/opt/others")
+    assert variables_of(make, capfd, "PYTHONPATH", "PYTHONHOME") == [str(ROOT), None]
+
+
+def test_packages_are_installed_into_the_environment_alone(
+    make: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Variables for pip that say where to install, and packages that would count as installed."""
+    python = tmp_path / "bin/python"
+    python.parent.mkdir()
+    python.write_text('#!/bin/sh\necho "$@"\nenv\n')
+    python.chmod(0o755)
+    misleading = {"PIP_TARGET": "/x", "PIP_PREFIX": "/x", "PIP_ROOT": "/x", "PYTHONPATH": "/x"}
+    for name, value in {**misleading, "PIP_USER": "1", "PIP_PROXY": "http://proxy:3"}.items():
+        monkeypatch.setenv(name, value)
+    command, *lines = make.pip(tmp_path, "install", "numpy").splitlines()
+    assert command.split()[:3] == ["-I", "-m", "pip"]
+    assert "PIP_PROXY=http://proxy:3" in lines
+    assert "PIP_USER=0" in lines
+    assert not {line.partition("=")[0] for line in lines} & set(misleading)
