@@ -351,3 +351,68 @@ def test_many_kills_of_snakemake(number: int, checkout: Checkout) -> None:
     for run in checkout.plan().runs:
         records.verify_record(checkout.folder / "results" / run.path)
     assert not list(checkout.folder.glob("results/.work/*/*"))
+
+
+@pytest.fixture
+def odd(tmp_path: Path) -> Checkout:
+    """A checkout in a path that needs quotes."""
+    folder = tmp_path / 'it\'s "a" $HOME é\\d'
+    folder.mkdir()
+    copy = Checkout(folder)
+    copy.configure()
+    return copy
+
+
+def test_a_path_that_needs_quotes(odd: Checkout) -> None:
+    """Tables are drawn by scripts, runs are trained by a shell command."""
+    odd.configure(seeds=[100], log_points=2, budget={"off_policy": 200})
+    odd.fill_in_records()
+    shutil.rmtree(odd.folder / "results" / odd.plan().runs[0].path)
+    odd.snakemake("aggregate")
+    assert (odd.folder / "results/summary/runs.csv").read_text().count("\n") == 3
+
+
+@pytest.mark.parametrize("name", ["a b", "it's", "$HOME", "a;b"])
+def test_an_interpreter_that_needs_quotes_is_refused_at_once(
+    name: str, checkout: Checkout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = checkout.folder / name
+    environment.symlink_to(sys.prefix)
+    monkeypatch.setattr(sys, "executable", str(environment / "bin/python"))
+    (line,) = checkout.snakemake("-n", "all", check=False).splitlines()
+    assert line.startswith(f"error: Snakemake cannot call an interpreter in {environment}: ")
+    assert not (checkout.folder / "results").exists()
+
+
+def test_a_colon_in_the_path_is_one_line(tmp_path: Path) -> None:
+    folder = tmp_path / "a:b"
+    folder.mkdir()
+    copy = Checkout(folder)
+    (line,) = copy.snakemake("-n", "all", check=False).splitlines()
+    assert line == f"error: PYTHONPATH cannot hold {folder}: move it to a path without ':'"
+
+
+@pytest.mark.parametrize(
+    ("blocked", "arguments"), [(".snakemake", ("-n", "all")), ("results/.work", ("aggregate",))]
+)
+def test_what_cannot_be_written_is_one_line(
+    blocked: str, arguments: tuple[str, ...], checkout: Checkout
+) -> None:
+    """A file in place of the folder: nobody can write there, the superuser neither."""
+    checkout.fill_in_records()
+    (checkout.folder / blocked).touch()
+    (line,) = checkout.snakemake(*arguments, check=False).splitlines()
+    assert line.startswith(f"error: cannot write in {checkout.folder}, ")
+    assert blocked in line
+
+
+def test_a_run_finds_its_own_packages_in_any_folder(checkout: Checkout) -> None:
+    checkout.configure(seeds=[100], log_points=2, budget={"off_policy": 200})
+    elsewhere = checkout.folder / "elsewhere"
+    for name in ("envs", "safemr"):
+        (elsewhere / name).mkdir(parents=True)
+        (elsewhere / name / "__init__.py").write_text("raise ImportError('not that one')\n")
+    run = checkout.plan().runs[0]
+    target = f"results/{run.path}/provenance.json"
+    checkout.snakemake("--directory", str(elsewhere), target)
+    records.verify_record(elsewhere / "results" / run.path)

@@ -3,6 +3,18 @@ import os
 import re
 import sys
 
+# Said before anything runs: Snakemake calls the interpreter of a script without quotes, and
+# PYTHONPATH is split at colons.
+if re.search(r"[^\w@%+=:,./-]", sys.executable):
+    sys.exit(
+        f"error: Snakemake cannot call an interpreter in {sys.prefix}: use an environment whose path "
+        "has no spaces, quotes or other special characters (python3 make.py makes one by itself)"
+    )
+if os.pathsep in workflow.basedir:
+    sys.exit(
+        f"error: PYTHONPATH cannot hold {workflow.basedir}: move it to a path without {os.pathsep!r}"
+    )
+
 # The sources beside this Snakefile come first, here and in every job.
 sys.path.insert(0, workflow.basedir)
 os.environ["PYTHONPATH"] = os.pathsep.join(

@@ -51,11 +51,14 @@ def recover(state):
 
 # One Snakemake at a time makes the files under a results root, from whatever folder it was started:
 # Snakemake's own lock is looked up and written in two steps, and invites to be removed by hand.
-if workflow.is_main_process and not workflow.output_settings.dryrun:
-    ROOT_LOCK = ProcessLock(
-        Path(RESULTS, ".work", "snakemake.lock"), f"makes the files under {RESULTS}"
-    )
-    ROOT_LOCK.acquire(wait=True)
+try:
+    if workflow.is_main_process and not workflow.output_settings.dryrun:
+        ROOT_LOCK = ProcessLock(
+            Path(RESULTS, ".work", "snakemake.lock"), f"makes the files under {RESULTS}"
+        )
+        ROOT_LOCK.acquire(wait=True)
 
-if workflow.is_main_process:
-    ALIVE = recover(Path(".snakemake"))
+    if workflow.is_main_process:
+        ALIVE = recover(Path(".snakemake"))
+except OSError as error:
+    sys.exit(f"error: cannot write in {os.getcwd()}, which a dry run needs, too: {error}")

@@ -24,7 +24,7 @@ rule train:
         variant=lambda wildcards: run_of(wildcards).variant,
         root=RESULTS,
     shell:
-        "exec {sys.executable:q} -u -m safemr.train --resolved {params.resolved:q}"
+        "exec {sys.executable:q} -u -P -m safemr.train --resolved {params.resolved:q}"
         " --variant {params.variant:q} --root {params.root:q} --die-with-parent --wait"
         # The mirror is no part of a run: what is not in `params` does not make it train again.
         " --wandb {CONFIG.wandb_mode:q} --wandb-project {CONFIG.wandb_project:q}"
