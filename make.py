@@ -7,7 +7,7 @@
 
 The environment is .venv, or the folder that SAFEMR_VENV names. It is built on first use from
 requirements.lock, and built again when that file or the Python version changes, or when building
-it was interrupted.
+it was interrupted. A folder that was not made here is never touched.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent
 LOCK = ROOT / "requirements.lock"
 STAMP = "complete"  # written last; holds the key of what the environment was built from
+MARK = "made-by-safemr"  # written first: the folder, and what is in it, is ours to build again
 HEADER = """\
 # Everything that the pipeline and the tests need, with exact versions.
 # Renewed by `python3 make.py lock` from pyproject.toml.
@@ -41,7 +42,12 @@ def main(arguments: Sequence[str]) -> int:
     if command == "lock" and not rest:
         return write_lock()
     if command == "all":
-        return check(rest) or run("python", "-m", "snakemake", "-j2", "--keep-going", "all", *rest)
+        # Of a dry run: what is trained and how many jobs there are. Snakemake's reasons name every
+        # file of every record in one line; `snakemake -n all` prints them.
+        quiet = ["--quiet", "rules", "host"] if any(map(is_dry, rest)) else []
+        return check(rest) or run(
+            "python", "-m", "snakemake", "-j2", *quiet, "--keep-going", "all", *rest
+        )
     if command == "test":
         return run("python", "-m", "pytest", "-n", "2", "-m", "not slow", *rest)
     if command == "run" and rest and rest != ["--"]:
@@ -68,6 +74,11 @@ def run(*command: str) -> int:
         return 130
 
 
+def is_dry(argument: str) -> bool:
+    """Whether an argument asks Snakemake for a dry run: -n, -np, --dry-run."""
+    return bool(re.fullmatch(r"-[a-zA-Z]*n[a-zA-Z]*|--dry-?run", argument))
+
+
 def check(arguments: Sequence[str]) -> int:
     """Say in one line what is wrong with a --configfile; Snakemake would show a traceback."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -84,8 +95,7 @@ def environment() -> Path:
     with exclusive(folder.with_name(folder.name + ".lock")):
         if stamp.is_file() and stamp.read_text() == key:
             return folder
-        if folder.is_dir() and any(folder.iterdir()) and not (folder / "pyvenv.cfg").is_file():
-            sys.exit(f"error: {folder} is not a virtual environment; choose another SAFEMR_VENV")
+        clear(folder)
         print(f"Setting up {folder} (some minutes, once)", flush=True)
         create(folder)
         pip(folder, "install", "--quiet", "-r", str(LOCK))
@@ -98,14 +108,35 @@ def environment() -> Path:
 def exclusive(path: Path) -> Iterator[None]:
     """Only one process at a time builds an environment; a dead one holds nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w") as stream:
+    with open(path, "a") as stream:  # "a" leaves alone what somebody else keeps under this name
         fcntl.flock(stream, fcntl.LOCK_EX)
         yield
 
 
+def clear(folder: Path) -> None:
+    """Empty an environment that was made here, or is to be; any other folder is refused."""
+    if folder.exists() and not folder.is_dir():
+        sys.exit(f"error: {folder} is a file; choose another SAFEMR_VENV")
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = [path for path in folder.iterdir() if path.name != MARK]
+    stamp = folder / STAMP  # alone in what was built before there was a mark
+    stamped = stamp.is_file() and re.fullmatch("[0-9a-f]{64}", stamp.read_text(errors="replace"))
+    if entries and not stamped and not (folder / MARK).is_file():
+        sys.exit(
+            f"error: {folder} was not made by this program and is left as it is; choose another "
+            "folder by SAFEMR_VENV"
+        )
+    (folder / MARK).write_text("python3 make.py builds and clears this environment\n")
+    for path in entries:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+
+
 def create(folder: Path) -> None:
     try:
-        venv.create(folder, clear=True, with_pip=True)
+        venv.create(folder, with_pip=True)
     except subprocess.CalledProcessError:
         sys.exit("error: this Python cannot make environments; install its venv and pip packages")
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import gymnasium
 
+from envs.aircraft import MAX_EPISODE_STEPS
 from envs.tasks import REGISTERED_TASKS
 
 for _task in REGISTERED_TASKS.values():
@@ -27,4 +28,5 @@ gymnasium.register(
     id="Aircraft-v0",
     entry_point="envs.aircraft:AircraftEnv",
     vector_entry_point="envs.aircraft:AircraftVectorEnv",
+    max_episode_steps=MAX_EPISODE_STEPS,
 )

@@ -15,22 +15,34 @@ unconstrained optimum ignores the traffic, and safety is all that there is to le
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import reprlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
+
+from envs.contract import (
+    RESET_MASK,
+    BatchEnvironment,
+    Independent,
+    ScalarEnvironment,
+    checked_limit,
+    checked_render_mode,
+)
 
 Floats = NDArray[np.float64]
 
 # Relative positions in which encounters begin and end [m]: the released experiment's box.
 BOX_LOW = np.array([-6.0, -10.0])
 BOX_HIGH = np.array([20.0, 10.0])
+
+NAME = "Aircraft"
+MAX_EPISODE_STEPS = 200
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
 
 @dataclass(frozen=True)
@@ -119,15 +131,18 @@ def outside_box(states: Floats) -> NDArray[np.bool_]:
     return np.any((position < BOX_LOW) | (position > BOX_HIGH), axis=-1)
 
 
-class _Encounters:
+class _Encounters(Independent):
     """N independent encounters: everything that the scalar and the batched environment share."""
 
-    def __init__(self, num_envs: int, other_turn: float) -> None:
+    def __init__(self, num_envs: int, other_turn: float, step_limit: int) -> None:
+        if isinstance(other_turn, bool) or not isinstance(other_turn, int | float):
+            raise ValueError(f"{NAME}: other_turn must be a number [rad/s], got {other_turn!r}")
         self.dynamics = AircraftDynamics(other_turns=(float(other_turn),))
         self.num_envs = num_envs
-        self.generators: list[np.random.Generator] = []
+        self.generators = [seeding.np_random()[0] for _ in range(num_envs)]
         self.states = np.full((num_envs, 3), np.nan)
         self.steps = np.zeros(num_envs, np.int64)
+        self.step_limit = step_limit
 
     def reset(self, index: int) -> None:
         """Uniform on the box and all headings, but not in collision. Unavoidable collisions stay:
@@ -140,15 +155,54 @@ class _Encounters:
         self.states[index] = state
         self.steps[index] = 0
 
-    def place(self, states: ArrayLike) -> None:
-        """Start the encounters from given states [N, 3]."""
-        placed = np.array(states, float).reshape(-1, 3)
-        if placed.shape != self.states.shape or not np.all(np.isfinite(placed)):
+    def begin(self, mask: NDArray[np.bool_], options: Mapping[str, Any]) -> None:
+        """Start the encounters where mask [N] is true, from `options["state"]` if it is given."""
+        if "state" not in options:
+            for index in np.flatnonzero(mask).tolist():
+                self.reset(index)
+            return
+        try:
+            placed = np.array(options["state"], float).reshape(self.states.shape)
+        except (TypeError, ValueError):
+            placed = np.full_like(self.states, np.nan)
+        if not np.all(np.isfinite(placed[mask])):
             raise ValueError(
-                f"options['state'] must be {self.num_envs} finite states [x, y, psi], "
-                f"not an array of shape {np.shape(states)}"
+                f"{NAME}: options['state'] must be {self.num_envs} finite states [x, y, psi], "
+                f"not {reprlib.repr(options['state'])}"
             )
-        self.states, self.steps = placed, np.zeros(self.num_envs, np.int64)
+        self.states[mask], self.steps[mask] = placed[mask], 0
+
+    def get_state(self) -> dict[str, Any]:
+        """Everything that the future depends on, in arrays and plain integers."""
+        generators = {}
+        for index, generator in enumerate(self.generators):
+            bits: dict[str, Any] = dict(generator.bit_generator.state)
+            generators[index] = {
+                **bits["state"],
+                "has_uint32": bits["has_uint32"],
+                "uinteger": bits["uinteger"],
+            }
+        return {"states": self.states.copy(), "steps": self.steps.copy(), "generators": generators}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue bit-identically from a `get_state` of as many encounters."""
+        if "states" not in state:
+            raise ValueError(f"{NAME}: this is no snapshot of the aircraft task")
+        if np.shape(state["states"]) != (self.num_envs, 3):
+            raise ValueError(
+                f"{NAME}: the state is of {len(state['states'])} encounters, this environment has "
+                f"{self.num_envs}"
+            )
+        self.states = np.array(state["states"], float)
+        self.steps = np.array(state["steps"], np.int64)
+        for index, generator in enumerate(self.generators):
+            saved = state["generators"][index]
+            generator.bit_generator.state = {
+                "bit_generator": "PCG64",
+                "state": {"state": saved["state"], "inc": saved["inc"]},
+                "has_uint32": saved["has_uint32"],
+                "uinteger": saved["uinteger"],
+            }
 
     def advance(
         self, actions: ArrayLike
@@ -156,13 +210,17 @@ class _Encounters:
         """One control period: rewards, terminated, truncated [N] and info of the states reached."""
         given = np.asarray(actions)
         if given.dtype.kind not in "fiu":
-            raise ValueError(f"actions must be real numbers, not {given.dtype}")
+            raise ValueError(f"{NAME}: actions must be real numbers, not {given.dtype}")
         turns = given.astype(float)
         if turns.shape != (self.num_envs, 1):
-            raise ValueError(f"actions must have shape ({self.num_envs}, 1), not {turns.shape}")
+            raise ValueError(
+                f"{NAME}: actions must have shape ({self.num_envs}, 1), not {turns.shape}"
+            )
         if not np.all(np.isfinite(turns)):
             culprit = int(np.argmin(np.isfinite(turns[:, 0])))
-            raise ValueError(f"action {turns[culprit, 0]} of encounter {culprit} is not finite")
+            raise ValueError(
+                f"{NAME}: action {turns[culprit, 0]} of encounter {culprit} is not finite"
+            )
         limit = self.dynamics.turn_limit
         a = np.clip(turns[:, 0], -limit, limit)
         self.states = self.dynamics.flow(self.states, a, self.dynamics.other_turns[0])
@@ -175,7 +233,7 @@ class _Encounters:
         # Outside the box nothing is at stake: flying straight on costs nothing, so the value is 0.
         # A bootstrap there would come from states that no transition starts in.
         ended = collided | outside_box(self.states)
-        over = self.steps >= AircraftEnv.max_episode_steps
+        over = self.steps >= self.step_limit
         return -np.square(a), ended, over & ~ended, info
 
     def info(self) -> dict[str, NDArray[Any]]:
@@ -195,12 +253,17 @@ class _Aircraft:
 
     d_min = AircraftDynamics.d_min
     num_obstacles = 1
-    max_episode_steps = 200
+    setting_names = ("max_episode_steps", "other_turn")
     task_version = 2  # 1: leaving the box truncated
     observation_layout: ClassVar[dict[str, slice]] = {
         "position": slice(0, 2),
         "heading": slice(2, 4),
     }
+    _simulation: _Encounters
+
+    @property
+    def dynamics(self) -> AircraftDynamics:
+        return self._simulation.dynamics
 
 
 def _spaces() -> tuple[Any, Any]:
@@ -215,7 +278,7 @@ def _spaces() -> tuple[Any, Any]:
     )
 
 
-class AircraftEnv(_Aircraft, gymnasium.Env[Floats, NDArray[np.float32]]):
+class AircraftEnv(_Aircraft, ScalarEnvironment):
     """One encounter.
 
     Action: the evader's turn rate [rad/s], clipped to [-1, 1]. Observation: [x, y, cos psi,
@@ -225,66 +288,65 @@ class AircraftEnv(_Aircraft, gymnasium.Env[Floats, NDArray[np.float32]]):
     are not finite or not of shape (1,).
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = METADATA
+    options = ("state",)
 
-    def __init__(self, other_turn: float = 1.0, render_mode: str | None = None) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
-        self.render_mode = render_mode
+    def __init__(
+        self,
+        other_turn: float = 1.0,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        self._name = NAME
+        self.render_mode = checked_render_mode(NAME, render_mode)
         self.observation_space, self.action_space = _spaces()
-        self._encounters = _Encounters(1, other_turn)
-
-    @property
-    def dynamics(self) -> AircraftDynamics:
-        return self._encounters.dynamics
+        limit = checked_limit(NAME, max_episode_steps, MAX_EPISODE_STEPS)
+        self._simulation = _Encounters(1, other_turn, limit)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._encounters.generators = [self.np_random]
-        if options and "state" in options:
-            self._encounters.place(options["state"])
-        else:
-            self._encounters.reset(0)
-        return observe(self._encounters.states[0]), _first(self._encounters.info())
+        self._simulation.begin(np.ones(1, bool), self._begin(seed, options))
+        self._placed = self._running = True
+        return observe(self._simulation.states[0]), _first(self._simulation.info())
 
     def step(self, action: NDArray[np.float32]) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
-        rewards, terminated, truncated, info = self._encounters.advance(np.asarray(action)[None])
-        observation = observe(self._encounters.states[0])
+        if not self._running:
+            raise self._refusal()
+        rewards, terminated, truncated, info = self._simulation.advance(np.asarray(action)[None])
+        self._running = not (terminated[0] or truncated[0])
+        observation = observe(self._simulation.states[0])
         return observation, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), _first(info)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Top view in the evader's frame, uint8 [260, 260, 3], or None without a render mode."""
-        if self.render_mode is None:
-            return None
-        return _draw(self._encounters.states[0], self.d_min)
+    def _frame(self) -> NDArray[np.uint8]:
+        """Top view in the evader's frame, [260, 260, 3]."""
+        return _draw(self._simulation.states[0], self.d_min)
 
 
-class AircraftVectorEnv(_Aircraft, VectorEnv[Floats, NDArray[np.float32], NDArray[Any]]):
+class AircraftVectorEnv(_Aircraft, BatchEnvironment):
     """N encounters advanced together; an ended one restarts within the same step.
 
-    ``reset(seed=s)`` seeds encounter i with s + i, so it repeats `AircraftEnv` seeded so;
-    ``options={"state": [N, 3]}`` chooses the starts. Observations [N, 4], actions [N, 1].
+    ``reset(seed=s)`` seeds encounter i with s + i, so it repeats `AircraftEnv` seeded so; in a
+    sequence of seeds None keeps an encounter's generator. ``options={"state": [N, 3]}`` chooses the
+    starts, ``{"reset_mask": bool [N]}`` which encounters start anew. Observations [N, 4], actions
+    [N, 1].
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-        "render_modes": [],
-    }
+    metadata = METADATA | BatchEnvironment.metadata
+    options = ("state", RESET_MASK)
 
-    def __init__(self, num_envs: int = 1, other_turn: float = 1.0) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, not {num_envs}")
-        self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = _spaces()
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._encounters = _Encounters(num_envs, other_turn)
-
-    @property
-    def dynamics(self) -> AircraftDynamics:
-        return self._encounters.dynamics
+    def __init__(
+        self,
+        num_envs: int = 1,
+        other_turn: float = 1.0,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        self._name = NAME
+        self.render_mode = checked_render_mode(NAME, render_mode)
+        self._set_spaces(num_envs, _spaces())
+        limit = checked_limit(NAME, max_episode_steps, MAX_EPISODE_STEPS)
+        self._simulation = _Encounters(num_envs, other_turn, limit)
 
     def reset(
         self,
@@ -292,20 +354,17 @@ class AircraftVectorEnv(_Aircraft, VectorEnv[Floats, NDArray[np.float32], NDArra
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Floats, dict[str, Any]]:
-        encounters = self._encounters
-        if seed is not None or not encounters.generators:
-            encounters.generators = [seeding.np_random(s)[0] for s in self._seeds(seed)]
-        if options and "state" in options:
-            encounters.place(options["state"])
-        else:
-            for index in range(self.num_envs):
-                encounters.reset(index)
-        return observe(encounters.states), _masked(encounters.info())
+        mask, given = self._begin(seed, options)
+        self._simulation.begin(mask, given)
+        self._started = True
+        return observe(self._simulation.states), _masked(self._simulation.info(), mask)
 
     def step(
         self, actions: NDArray[np.float32]
     ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        encounters = self._encounters
+        if not self._started:
+            raise self._refusal()
+        encounters = self._simulation
         rewards, terminated, truncated, info = encounters.advance(actions)
         ended = terminated | truncated
         infos = _masked(info)
@@ -319,51 +378,9 @@ class AircraftVectorEnv(_Aircraft, VectorEnv[Floats, NDArray[np.float32], NDArra
             infos["d"], infos["d_dot"] = started["d"], started["d_dot"]
         return observe(encounters.states), rewards, terminated, truncated, infos
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> Sequence[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + index for index in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"{len(seed)} seeds were given for {self.num_envs} environments")
-        return seed
-
-    def get_state(self) -> dict[str, Any]:
-        """Everything that the future depends on, in arrays and plain integers."""
-        generators = {}
-        for index, generator in enumerate(self._encounters.generators):
-            bits: dict[str, Any] = dict(generator.bit_generator.state)
-            generators[index] = {
-                **bits["state"],
-                "has_uint32": bits["has_uint32"],
-                "uinteger": bits["uinteger"],
-            }
-        return {
-            "states": self._encounters.states.copy(),
-            "steps": self._encounters.steps.copy(),
-            "generators": generators,
-        }
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Continue bit-identically from a `get_state` of an environment of the same size."""
-        if np.shape(state["states"]) != (self.num_envs, 3):
-            raise ValueError(
-                f"the state is of {len(state['states'])} encounters, this environment has "
-                f"{self.num_envs}"
-            )
-        self._encounters.states = np.array(state["states"], float)
-        self._encounters.steps = np.array(state["steps"], np.int64)
-        self._encounters.generators = []
-        for index in range(len(state["generators"])):
-            saved = state["generators"][index]
-            bits = np.random.PCG64()
-            bits.state = {
-                "bit_generator": "PCG64",
-                "state": {"state": saved["state"], "inc": saved["inc"]},
-                "has_uint32": saved["has_uint32"],
-                "uinteger": saved["uinteger"],
-            }
-            self._encounters.generators.append(np.random.Generator(bits))
+    def _frame(self, index: int) -> NDArray[np.uint8]:
+        """Top view in the evader's frame, [260, 260, 3]."""
+        return _draw(self._simulation.states[index], self.d_min)
 
 
 def _first(info: dict[str, NDArray[Any]]) -> dict[str, Any]:

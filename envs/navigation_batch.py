@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
+from envs.contract import Independent
 from envs.layout import sample_goal, sample_layout
 from envs.navigation_kernels import SCORES, observation_blocks, observe, score, task_distances
 from envs.navigation_physics import Worlds
@@ -35,10 +36,11 @@ class Scene:
     vase: Array | None  # [3] x, y, yaw
 
 
-class NavigationBatch:
+class NavigationBatch(Independent):
     """N worlds of one task without autoreset.
 
     generators: one `numpy.random.Generator` a world, all that a reset or a new goal depends on.
+    step_limit: the steps of an episode, by default the task's.
     """
 
     def __init__(self, task: NavigationTask, num_worlds: int) -> None:
@@ -46,6 +48,7 @@ class NavigationBatch:
         self.worlds = Worlds(task, num_worlds)
         self.generators = [seeding.np_random()[0] for _ in range(num_worlds)]
         self.steps = np.zeros(num_worlds, np.int64)
+        self.step_limit = task.max_episode_steps
         self._distances = np.zeros((num_worlds, 2))
         self._hazard_size = 0.0 if task.solid_obstacles else task.obstacle_size
         layout = task.observation_layout
@@ -94,7 +97,7 @@ class NavigationBatch:
             distances = self._measure()
         self._distances = distances
         self.steps += 1
-        truncated = self.steps >= self.task.max_episode_steps
+        truncated = self.steps >= self.step_limit
         info: Info = dict(zip(SCORES, scores, strict=True))
         info |= {"goal_met": goal_met, "diverged": diverged}
         return info.pop("reward"), terminated, truncated, info
@@ -152,6 +155,8 @@ class NavigationBatch:
 
         Raises ValueError for a snapshot of another task or another number of worlds.
         """
+        if "worlds" not in state:
+            raise ValueError(f"{self.task.name}: this is no snapshot of a navigation task")
         self.worlds.set_state(state["worlds"])
         self.steps[:] = state["steps"]
         for index, generator in enumerate(self.generators):

@@ -6,11 +6,13 @@ import copy
 import functools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.contract import Independent
 from envs.layout import Layout
 from envs.navigation_kernels import kinematics, read_states, write_controls
 from envs.tasks import NavigationTask
@@ -55,7 +57,7 @@ def compile_model(task: NavigationTask) -> mujoco.MjModel:
     return copy.copy(_compile(task))
 
 
-class Worlds:
+class Worlds(Independent):
     """N worlds, each with its own MjModel (the layout lives there) and MjData.
 
     Stacked arrays, valid after `place`, `step` and `set_state`, with the shapes of
@@ -92,6 +94,24 @@ class Worlds:
 
     def __len__(self) -> int:
         return len(self.models)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy gets MuJoCo structures of its own, at addresses of its own. MuJoCo's pickles of an
+        # MjData leave out the private lists of sleeping bodies; a snapshot restores them.
+        arrays = {name: a for name, a in vars(self).items() if isinstance(a, np.ndarray)}
+        del arrays["_addresses"]
+        return {
+            "task": self.task,
+            "snapshot": self.get_state(),
+            "arrays": arrays,
+            "diverged": self._diverged(),
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        Worlds.__init__(self, state["task"], len(state["diverged"]))
+        self._load(state["snapshot"], state["diverged"])
+        for name, array in state["arrays"].items():
+            getattr(self, name)[:] = array
 
     def place(self, layouts: Mapping[int, Layout]) -> None:
         """Put the worlds with these indices at rest in a layout."""
@@ -167,15 +187,21 @@ class Worlds:
                     f"{self.task.name}: state {name!r} must have shape {array.shape}, got {found}; "
                     "restore into an environment with the same task, settings and num_envs"
                 )
+        self._load({name: state[name] for name in own}, np.zeros(len(self), np.bool_))
+
+    def _load(self, state: Mapping[str, NDArray], diverged: NDArray[np.bool_]) -> None:
         for name in ("start", "goal", "obstacles", "obstacle_yaws"):
             getattr(self, name)[:] = state[name]
         for index in range(len(self)):
             self._write_layout(index)
             self.move_goal(index, self.goal[index])
-            self._restore(index, {name: state[name][index] for name in own})
+            self._restore(
+                index, {name: a[index] for name, a in state.items()}, forward=not diverged[index]
+            )
         self._read()
 
-    def _restore(self, index: int, state: Mapping[str, NDArray]) -> None:
+    def _restore(self, index: int, state: Mapping[str, NDArray], forward: bool) -> None:
+        """forward: whether MuJoCo can make anything of the numbers; else they are just written."""
         model, data = self.models[index], self.data[index]
 
         def write() -> None:
@@ -184,6 +210,8 @@ class Worlds:
 
         mujoco.mj_resetData(model, data)
         write()
+        if not forward:
+            return
         asleep = state["asleep"] >= 0
         if asleep.any():
             # The lists of awake bodies are private to MuJoCo. One step in which anything may fall
@@ -203,6 +231,12 @@ class Worlds:
         model.body_pos[bodies, :2] = np.vstack([self.start[index, :2], self.obstacles[index]])
         yaws = [self.start[index, 2], *self.obstacle_yaws[index]]
         model.body_quat[bodies] = [_yaw_quaternion(yaw) for yaw in yaws]
+
+    def _diverged(self) -> NDArray[np.bool_]:
+        diverged = np.empty(len(self), np.bool_)
+        scratch = (self.qpos.copy(), self.qvel.copy(), self.qacc.copy())
+        read_states(self._addresses, *scratch, diverged)
+        return diverged
 
     def _read(self) -> NDArray[np.bool_]:
         diverged = np.empty(len(self), np.bool_)

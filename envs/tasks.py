@@ -109,13 +109,18 @@ class NavigationTask:
             start += sizes[name]
         return layout
 
+    @property
+    def setting_names(self) -> list[str]:
+        """The fields that `with_settings` changes."""
+        return sorted({f.name for f in fields(self)} - {"name", "family", "version"})
+
     def with_settings(self, **settings: Any) -> NavigationTask:
         """A copy with some fields changed. Raises ValueError naming an unknown setting."""
-        allowed = {f.name for f in fields(self)} - {"name", "family", "version"}
-        unknown = sorted(set(settings) - allowed)
+        unknown = sorted(set(settings) - set(self.setting_names))
         if unknown:
             raise ValueError(
-                f"{self.name} has no setting {unknown[0]!r}; settings: {', '.join(sorted(allowed))}"
+                f"{self.name} has no setting {unknown[0]!r}; "
+                f"settings: {', '.join(self.setting_names)}"
             )
         return replace(self, **settings)
 

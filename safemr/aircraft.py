@@ -22,13 +22,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
+from safemr import reference
+from safemr.conventions import COVERS
 from safemr.energy import energy, magnitude, scaled
+from safemr.errors import UserError
 from safemr.evaluate import Acts
 from safemr.reachability.grid import Floats
-from safemr.reachability.solver import Solution
+from safemr.reachability.solver import CONSTANT, Solution
+from safemr.tasks import Task, base_of, name_of, settings_of, task_settings
 
 Certificate = Callable[[Floats], Floats]
-COVERS = 0.01  # a certificate counts as covering up to this share of the shell missed
+
+
+def dynamics_of(task: Task) -> AircraftDynamics:
+    """The encounter of a task, for the solver and for flights; its traffic may turn otherwise.
+
+    Raises UserError where the solved value would be that of another task.
+    """
+    if base_of(task) != reference.AIRCRAFT_TASK:
+        raise UserError(f"{name_of(task)} is no encounter of two aircraft: it has no true set here")
+    (turn,) = CONSTANT.other_turns
+    for name, value in task_settings(settings_of(task)).items():
+        if name != "other_turn":
+            raise UserError(
+                f"{name_of(task)}: no true unsafe set is solved for its {name} = {value}"
+            )
+        turn = float(value)
+    if not abs(turn) <= 1:  # what the solver's grid and horizon are made for
+        raise UserError(
+            f"{name_of(task)}: other_turn = {turn:g}: true unsafe sets are solved for traffic that "
+            "turns at most 1 rad/s"
+        )
+    return replace(CONSTANT, other_turns=(turn,))
 
 
 @dataclass(frozen=True)
@@ -266,7 +291,7 @@ def fly(policy: Acts, starts: Floats, dynamics: AircraftDynamics) -> Flights:
     if len(dynamics.other_turns) != 1:
         raise ValueError("flights need traffic of constant turn rate")
     envs: Any = gymnasium.make_vec(
-        "Aircraft-v0",
+        f"envs:{reference.AIRCRAFT_TASK}-v0",
         num_envs=len(starts),
         vectorization_mode="vector_entry_point",
         other_turn=dynamics.other_turns[0],

@@ -11,31 +11,29 @@ does not apply to a row is nan.
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
-from safemr import aircraft, reachability, records, reference, statistics
+from safemr import aircraft, reachability, reference, statistics
 from safemr.aircraft import Truth
+from safemr.conventions import COVERS
 from safemr.energy import constraint
-from safemr.errors import UserError
 from safemr.evaluate import Acts
 from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.plotting.aircraft import Slice
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
-from safemr.runs import describe_task
-from safemr.tables import ABSENT, Table, describe_missing
-
-if TYPE_CHECKING:
-    from safemr.policies import Policy
+from safemr.recorded_energy import Saved, learners
+from safemr.runs import installed
+from safemr.tables import ABSENT, FEW, Table, describe_missing, plus_minus
+from safemr.tasks import Task, name_of
 
 FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
 MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -84,22 +82,36 @@ class Obedient:
 class TrueSets:
     """The solved values of both cases and samples of the first, each made when first asked for.
 
-    ``solve`` returns the solution of a case; nobody waits for it where all numbers are kept.
+    ``solve`` returns the solution of a case; nobody waits for it where all numbers are kept. The
+    constant case is the traffic of ``task`` (`safemr.aircraft.dynamics_of`).
     """
 
     def __init__(
-        self, solve: Callable[[AircraftDynamics], Solution], log2_states: int = 19
+        self,
+        solve: Callable[[AircraftDynamics], Solution],
+        log2_states: int = 19,
+        task: Task = reference.AIRCRAFT_TASK,
     ) -> None:
-        self._solve, self.log2_states = solve, log2_states
+        self._solve, self.log2_states, self.task = solve, log2_states, task
+        self.dynamics = aircraft.dynamics_of(task)
 
     @classmethod
-    def cached(cls, folder: Path | str, log2_states: int = 19) -> TrueSets:
+    def cached(
+        cls, folder: Path | str, log2_states: int = 19, task: Task = reference.AIRCRAFT_TASK
+    ) -> TrueSets:
         """From the solutions kept in ``folder`` (`safemr.reachability.load_or_solve`)."""
-        return cls(functools.partial(reachability.load_or_solve, Path(folder)), log2_states)
+        return cls(functools.partial(reachability.load_or_solve, Path(folder)), log2_states, task)
+
+    def kept_as(self, label: str) -> tuple[str, dict[str, Any]]:
+        """Label and inputs of what is measured of the solution alone; those of the registered task
+        name none, as ever."""
+        if self.dynamics == reachability.CONSTANT:
+            return label, {}
+        return f"{label} {name_of(self.task)}", {"task": installed(self.task)}
 
     @functools.cached_property
     def constant(self) -> Solution:
-        return self._solve(reachability.CONSTANT)
+        return self._solve(self.dynamics)
 
     @functools.cached_property
     def adversarial(self) -> Solution:
@@ -118,12 +130,13 @@ def measured_frontier(
     measurements: Measurements, sets: TrueSets, missed_shares: Sequence[float] = MISSED_SHARES
 ) -> pd.DataFrame:
     """`frontier_table`, kept among ``measurements``."""
+    label, own = sets.kept_as("frontier")
     inputs = {
         "missed_shares": list(missed_shares), "solver": reachability.VERSION,
-        "log2_states": sets.log2_states,
+        "log2_states": sets.log2_states, **own,
     }  # fmt: skip
     rows = measurements.rows(
-        "aircraft_frontier", "frontier", inputs,
+        "aircraft_frontier", label, inputs,
         lambda: frontier_table(sets.truth, missed_shares).to_dict("records"),
     )  # fmt: skip
     return pd.DataFrame(rows)
@@ -146,15 +159,15 @@ def compare(
     """The comparison of recorded runs (rows of `records.read_records`'s index) and references.
 
     What is measured is kept among the measurements under ``root``. Raises UserError naming every
-    record whose policy file does not say what its certificate is.
+    record whose policy file does not say what its certificate is, and one of other traffic.
     """
     measurements = Measurements(root)
     shared = {
-        "task": describe_task("Aircraft", {}), "flights": flights, "starts_seed": STARTS_SEED,
+        "task": installed(sets.task), "flights": flights, "starts_seed": STARTS_SEED,
         "log2_states": sets.log2_states, "solver": reachability.VERSION,
     }  # fmt: skip
     rows = []
-    for run, saved in learners(root, runs):
+    for run, saved in learners(root, runs, sets.dynamics):
 
         def measure(saved: Saved = saved) -> dict[str, float]:
             own = _certificate(sets.truth, saved.zeta, saved.length_scale, saved.eta)
@@ -168,10 +181,11 @@ def compare(
         )
     inputs = {**shared, "certificates": {name: list(zeta) for name, zeta in CERTIFICATES.items()}}
     rows += measurements.rows(
-        "aircraft_references", "references", inputs, lambda: _references(sets, flights)
-    )
+        "aircraft_references", sets.kept_as("references")[0], inputs,
+        lambda: _references(sets, flights),
+    )  # fmt: skip
     table = pd.DataFrame(rows)
-    table["covers"] = table["missed_share"] <= aircraft.COVERS
+    table["covers"] = table["missed_share"] <= COVERS
     table["least_volume_ratio"] = np.interp(
         table["missed_share"], frontier["missed_share"], frontier["volume_ratio"]
     )
@@ -201,7 +215,7 @@ def _references(sets: TrueSets, flights: int) -> list[dict[str, Any]]:
     return rows
 
 
-def as_scores(comparison: pd.DataFrame, task: str = "Aircraft") -> pd.DataFrame:
+def as_scores(comparison: pd.DataFrame, task: str = reference.AIRCRAFT_TASK) -> pd.DataFrame:
     """The learners' rows as a score table: task, variant, seed, metric, value."""
     learners = comparison[comparison["kind"] == "learner"].drop(columns=["kind", "covers"])
     tidy = learners.melt(id_vars=["variant", "seed"], var_name="metric").dropna(subset="value")
@@ -238,7 +252,8 @@ def slices(
     The learned ones are those whose zeta is trained; every set contains the disc. The solved values
     are kept among ``measurements``.
     """
-    dynamics = reachability.CONSTANT
+    dynamics = sets.dynamics
+    label, own = sets.kept_as("slices")
     x, y = plane(spacing)
     planes = [
         np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
@@ -246,8 +261,8 @@ def slices(
     ]
     solved = measurements.arrays(
         "aircraft_slices",
-        "slices",
-        {"degrees": list(degrees), "spacing": spacing, "solver": reachability.VERSION},
+        label,
+        {"degrees": list(degrees), "spacing": spacing, "solver": reachability.VERSION, **own},
         lambda: {
             name: np.stack([solution(states) for states in planes]).astype(np.float32)
             for name, solution in (("truth", sets.constant), ("adversarial", sets.adversarial))
@@ -315,17 +330,22 @@ def table_lines(comparison: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = None) -> Table:
+def comparison_table(
+    comparison: pd.DataFrame,
+    missing: pd.DataFrame | None = None,
+    task: Task = reference.AIRCRAFT_TASK,
+) -> Table:
     """Learners (mean over seeds and half width of the 95% t interval), then the references."""
     caption = (
-        "Aircraft. Unsafe sets against the true one (constant traffic): volume over that of the "
-        "truth; share of the truth minus the collision disc that is missed (covers: at most "
-        f"{100 * aircraft.COVERS:g}%); least ratio: what the best [sigma, k, n] needs at the same "
+        f"{name_of(task)}. Unsafe sets against the true one (constant traffic): volume over that "
+        "of the truth; share of the truth minus the collision disc that is missed (covers: at most "
+        f"{100 * COVERS:g}%); least ratio: what the best [sigma, k, n] needs at the same "
         "share missed, by interpolation; states outside the disc where no turn keeps the "
         "constraint, with eta 0 and the learner's; states of the claimed safe set that every turn "
         f"leaves. Deterministic policies from {FLIGHTS:,} truly safe states: flights that collide, "
         "mean sum of a^2. The policy of a fixed certificate keeps its constraint with the least "
-        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval."
+        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval, "
+        f"or [its ends] where it is cut off at a bound of the quantity. {FEW}"
     )
     trained = (comparison["kind"] == "learner").any()
     notes = [_verdict(as_scores(comparison))] if trained else []
@@ -335,8 +355,9 @@ def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame | None = No
     return Table("aircraft", caption, comparison, lines, tuple(filter(None, notes)))
 
 
-def _verdict(scores: pd.DataFrame, method: str = "SafeMR", rival: str = "JointSIS") -> str:
+def _verdict(scores: pd.DataFrame) -> str:
     """What magnitude regularization changed, with Welch's intervals; "" without both learners."""
+    method, rival = reference.LEARNERS
     texts = []
     for metric, name, factor, unit in (
         ("volume_ratio", "volume ratio", 1.0, ""),
@@ -344,7 +365,7 @@ def _verdict(scores: pd.DataFrame, method: str = "SafeMR", rival: str = "JointSI
         ("iou", "IoU", 1.0, ""),
     ):
         ours, theirs = (
-            factor * statistics.scores_of(scores, "Aircraft", variant, metric)
+            factor * statistics.scores_of(scores, reference.AIRCRAFT_TASK, variant, metric)
             for variant in (method, rival)
         )
         gap = statistics.difference_interval(ours, theirs)
@@ -356,60 +377,12 @@ def _verdict(scores: pd.DataFrame, method: str = "SafeMR", rival: str = "JointSI
 
 
 def _cell(values: pd.Series, factor: float, digits: int) -> str:
-    estimate = statistics.mean_interval(factor * values.to_numpy(float))
-    if np.isnan(estimate.mean):
-        return ABSENT
-    if np.isnan(estimate.half_width):
-        return f"{estimate.mean:.{digits}f}"
-    return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
-
-
-@dataclass(frozen=True)
-class Saved:
-    """What a record says of its certificate."""
-
-    folder: Path
-    zeta: Floats  # [3] in units of length_scale
-    length_scale: float  # [m]
-    eta: float
-
-    def policy(self) -> Policy:
-        from safemr.policies import load_policy  # torch, which kept measurements do not need
-
-        return load_policy(self.folder)
-
-
-def learners(
-    root: Path, runs: pd.DataFrame, needed: Sequence[str] = ("zeta", "length_scale")
-) -> Sequence[tuple[Any, Saved]]:
-    """(run, what is saved of its certificate) of every record.
-
-    Raises UserError naming every record whose policy file lacks an array of ``needed``.
-    """
-    found, lacking = [], []
-    for run in runs.itertuples():
-        folder = root / str(run.folder)
-        if not (folder / records.POLICY).is_file():
-            lacking.append(str(run.folder))
-            continue
-        arrays = records.load_policy(folder / records.POLICY)
-        if not set(needed) <= arrays.keys():
-            lacking.append(str(run.folder))
-            continue
-        config = json.loads((folder / records.CONFIG).read_text())
-        saved = Saved(
-            folder=folder,
-            zeta=arrays["zeta"].astype(float),
-            length_scale=float(arrays["length_scale"]),
-            eta=float(config["algorithm"]["hyperparameters"]["eta"]),
-        )
-        found.append((run, saved))
-    if lacking:
-        raise UserError(
-            f"no {records.POLICY} with {' and '.join(needed)} in {', '.join(lacking)}: remove "
-            "these records to train them again, or take them out of aircraft.algorithms"
-        )
-    return found
+    """Shares are multiplied by 100; nothing here is negative, and no share above its whole."""
+    share = factor == 100 or values.name == "iou"
+    estimate = statistics.mean_interval(
+        factor * values.to_numpy(float), bounds=(0.0, factor if share else np.inf)
+    )
+    return ABSENT if np.isnan(estimate.mean) else plus_minus(*estimate[:3], digits)
 
 
 def _certificate(

@@ -10,6 +10,7 @@ paper prints.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -25,16 +26,20 @@ from safemr.energy import in_metres
 from safemr.errors import UserError
 from safemr.feasibility import BRAKINGS, CONVENTIONS, analytic_condition
 from safemr.measurements import Measurements, record_inputs, record_label
+from safemr.recorded_energy import require_zeta
 from safemr.records import CONFIG, POLICY, PROGRESS, PROVENANCE, parse_progress, verify_record
 from safemr.reference import Zeta
-from safemr.runs import describe_task
+from safemr.runs import describe_task, installed
+from safemr.strict_yaml import assignment
 from safemr.tables import Table
+from safemr.tasks import Task, base_of, name_of, settings_of, task_settings
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DEFAULT_TASK = "Pillars-0.15-Goal"
+DEFAULT_TASK = reference.SENSITIVITY_TASK  # Table II's
 DEFAULT_STATES = 2**16
+SAME_MARGIN = 1e-6  # processors differ by round-off
 
 
 @dataclass(frozen=True)
@@ -59,17 +64,19 @@ def paper_certificates() -> list[Certificate]:
     ]
 
 
-def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any]]:
-    """The certificate a run ended with, its task, and the task's settings.
+def certificate_of_record(folder: Path) -> tuple[Certificate, dict[str, Any]]:
+    """The certificate a run ended with, and its task: the entry in the run's config.
 
     The last logged sigma, k and n; `policy` is None where the record has none (it is optional).
-    Raises UserError where there is no record, or none of the energy-function family.
+    Raises UserError where there is no record, or none of the energy-function family, or where the
+    energy function is more than its sigma, k and n.
     """
     verify_record(folder)
     config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     last = parse_progress((folder / PROGRESS).read_text(encoding="utf-8"))[-1]
     if not last.keys() >= set(Zeta._fields):
         raise UserError(f"{folder}: its algorithm has no energy function to certify")
+    require_zeta(folder, config)
     hyperparameters, task = config["algorithm"]["hyperparameters"], config["task"]
     scale = float(hyperparameters.get("length_scale", 1.0))
     zeta = Zeta(*in_metres([last[name] for name in Zeta._fields], scale))
@@ -77,17 +84,16 @@ def certificate_of_record(folder: Path) -> tuple[Certificate, str, dict[str, Any
     variant = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["variant"]
     name = f"{variant} (seed {config['seed']})"
     policy = folder if (folder / POLICY).exists() else None
-    return Certificate(name, zeta, eta, policy), task["name"], dict(task.get("settings", {}))
+    return Certificate(name, zeta, eta, policy), dict(task)
 
 
 def certify(
     certificate: Certificate,
-    task: str = DEFAULT_TASK,
+    task: Task = DEFAULT_TASK,
     *,
     states: int = DEFAULT_STATES,
     seed: int = 0,
     episodes: int = 32,
-    settings: Mapping[str, Any] | None = None,
 ) -> tuple[dict[str, Any], falsification.Falsification]:
     """One row of the certificate table, and the search behind it.
 
@@ -99,10 +105,10 @@ def certify(
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
     analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
-    search = falsification.falsify(envs, zeta, eta=eta, count=states, seed=seed)
+    search = falsification.falsify(envs, task, zeta, eta=eta, count=states, seed=seed)
     envs.close()
     row: dict[str, Any] = {
-        "certificate": certificate.name, "task": task, **zeta._asdict(), "eta": eta,
+        "certificate": certificate.name, "task": name_of(task), **zeta._asdict(), "eta": eta,
         **{_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()},
         "states": len(search.states), "infeasible_share": search.infeasible_share,
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
@@ -113,7 +119,7 @@ def certify(
 
         check = falsification.check_policy(
             load_policy(certificate.policy), task, zeta, eta=eta, num_envs=episodes, seed=seed,
-            limit=8 * episodes, settings=settings,
+            limit=8 * episodes,
         )  # fmt: skip
         row |= {
             "policy_steps": check.steps,
@@ -126,24 +132,21 @@ def certify(
 def measured_certificate(
     measurements: Measurements,
     certificate: Certificate,
-    task: str,
+    task: Task,
     *,
     states: int,
     episodes: int,
-    settings: Mapping[str, Any],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of `certify` and the example of its search, kept among ``measurements``."""
     inputs = {
         "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
-        "task": describe_task(task, settings),
+        "task": installed(task),
         "states": states, "episodes": episodes,
         "policy": certificate.policy and record_inputs(certificate.policy),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
-        row, search = certify(
-            certificate, task, states=states, episodes=episodes, settings=settings
-        )
+        row, search = certify(certificate, task, states=states, episodes=episodes)
         return {"row": row, "example": search.example()}
 
     kept = measurements.rows("certificates", _label(certificate, task), inputs, measure)
@@ -151,12 +154,12 @@ def measured_certificate(
 
 
 def measured_margins(
-    measurements: Measurements, certificate: Certificate, task: str
+    measurements: Measurements, certificate: Certificate, task: Task
 ) -> tuple[pd.DataFrame, float]:
     """`margin_map` of a certificate, and the task's d_min, kept among ``measurements``."""
     inputs = {
         "zeta": list(certificate.zeta), "eta": certificate.eta,
-        "task": describe_task(task, {}),
+        "task": installed(task),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
@@ -212,7 +215,7 @@ def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def margin_map(
-    task: str, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
+    task: Task, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
 ) -> pd.DataFrame:
     """Best margin of the least favourable motion at each distance and bearing.
 
@@ -252,14 +255,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """`safemr certify`; prints the table and, with --out, writes table, picture and examples."""
     options = _parser().parse_args(arguments)
     if options.replay is not None:
-        return _replay(options.replay)
+        return _replay(options)
     jobs = _jobs(options)
     rows, searches = [], []
-    for certificate, task, settings in jobs:
-        print(f"certifying {certificate.name} on {task} ...", file=sys.stderr)
-        row, search = certify(
-            certificate, task, states=options.states, seed=options.seed, settings=settings
-        )
+    for certificate, task in jobs:
+        print(f"certifying {certificate.name} on {name_of(task)} ...", file=sys.stderr)
+        row, search = certify(certificate, task, states=options.states, seed=options.seed)
         rows.append(row)
         searches.append(search)
     table = certificate_table(rows)
@@ -271,12 +272,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, str, dict[str, Any]]]:
-    """What the command line asks for: (certificate, task, settings) each."""
+def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, Task]]:
+    """What the command line asks for: (certificate, task) each."""
     given = (options.sigma, options.k, options.n)
     if options.record:
         if any(value is not None for value in given):
             raise UserError("give either --record or --sigma, --k and --n, not both")
+        for name in ("task", "set", "eta"):
+            if getattr(options, name):
+                raise UserError(f"--{name}: a record says its own; leave it out beside --record")
         return [certificate_of_record(Path(folder)) for folder in options.record]
     if all(value is None for value in given):
         named = paper_certificates()
@@ -286,19 +290,53 @@ def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, str, dict[str,
         if min(options.sigma, options.k) < 0 or options.n <= 0:
             raise UserError("sigma and k must not be negative and n must be positive")
         named = [Certificate(options.name, Zeta(*given))]
-    return [(Certificate(c.name, c.zeta, options.eta), options.task, {}) for c in named]
+    task = _task(options.task or DEFAULT_TASK, options.set)
+    return [(Certificate(c.name, c.zeta, options.eta), task) for c in named]
+
+
+def _task(registered: str, assignments: Sequence[str]) -> Task:
+    """A registered task; with other settings (``task.NAME=VALUE``) under a name that says them."""
+    settings = dict(map(assignment, assignments))
+    for name in settings:
+        if not name.startswith("task."):
+            raise UserError(
+                f"--set {name}: only the environment has settings here: task.NAME=VALUE"
+            )
+    settings = {name.removeprefix("task."): value for name, value in settings.items()}
+    entry = describe_task(registered, settings, "--task")
+    changed = task_settings(settings)
+    return {**entry, "name": _named(registered, changed), "base": registered} if changed else entry
+
+
+def _named(registered: str, changed: Mapping[str, Any]) -> str:
+    """A task and its settings in words."""
+    said = ", ".join(f"{name}={value}" for name, value in sorted(changed.items()))
+    return f"{registered} with {said}" if said else registered
+
+
+def example_titles(jobs: Sequence[tuple[Certificate, Task]]) -> list[str]:
+    """A name for the example of each certificate on its task; equal ones are numbered."""
+    titles: list[str] = []
+    for certificate, task in jobs:
+        title = f"{certificate.name} on {name_of(task)}"
+        numbered = (f"{title}, {number}" for number in itertools.count(2))
+        titles.append(
+            title if title not in titles else next(t for t in numbered if t not in titles)
+        )
+    return titles
 
 
 def _write(
     folder: Path,
     table: Table,
-    jobs: Sequence[tuple[Certificate, str, Mapping[str, Any]]],
+    jobs: Sequence[tuple[Certificate, Task]],
     searches: Sequence[falsification.Falsification],
 ) -> None:
     from safemr.plotting import style
 
     table.write(folder)
-    examples = {job[0].name: search.example() for job, search in zip(jobs, searches, strict=True)}
+    found = [search.example() for search in searches]
+    examples = dict(zip(example_titles(jobs), found, strict=True))
     text = json.dumps(examples, indent=1, sort_keys=True) + "\n"
     (folder / "examples.json").write_text(text, encoding="utf-8")
     task = jobs[0][1]
@@ -307,13 +345,19 @@ def _write(
     style.save(picture(pictured, margins, _d_min(task)), folder / "certificates")
 
 
-def _replay(path: Path) -> int:
+def _replay(options: argparse.Namespace) -> int:
+    """Exit status 1 where an example does not come out as its file says."""
+    path = options.replay
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         examples = content if "state" not in content else {path.stem: content}
+        stated = {name: float(example["margin"]) for name, example in examples.items()}
+        for name, example in examples.items():
+            _check_task(options, f"{path}: {name}", installed(falsification.task_of(example)))
         results = {name: falsification.replay(example) for name, example in examples.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} holds no example written by --out ({error!r})") from error
+    differing = 0
     for name, (actions, g) in results.items():
         best = int(g.argmin())
         verdict = "no action is safe" if g[best] >= 0 else "a safe action exists"
@@ -321,7 +365,18 @@ def _replay(path: Path) -> int:
         print(
             f"{name}: {len(g)} actions, least g = {g[best]:+.6f} at ({a0:.3f}, {a1:.3f}): {verdict}"
         )
-    return 0
+        if abs(g[best] - stated[name]) > SAME_MARGIN:
+            differing += 1
+            print(f"{name}: the file says {stated[name]:+.6f}: another task or version made it")
+    return 1 if differing else 0
+
+
+def _check_task(options: argparse.Namespace, what: str, task: Task) -> None:
+    """Raises UserError where ``--task`` or ``--set`` ask for another task than an example's."""
+    asked = _task(options.task or base_of(task), options.set)
+    said, wanted = ((base_of(entry), task_settings(settings_of(entry))) for entry in (task, asked))
+    if (options.task or options.set) and said != wanted:
+        raise UserError(f"{what} is an example of {_named(*said)}, not of {_named(*wanted)}")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -331,7 +386,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--n", type=float)
     parser.add_argument("--eta", type=float, default=0.0, help="eta_D of the constraint")
     parser.add_argument("--name", default="given", help="name of --sigma, --k, --n in the table")
-    parser.add_argument("--task", default=DEFAULT_TASK, help=f"default {DEFAULT_TASK}")
+    parser.add_argument("--task", help=f"default {DEFAULT_TASK}")
+    parser.add_argument("--set", action="append", default=[], metavar="task.NAME=VALUE",
+                        help="a setting of the environment")  # fmt: skip
     parser.add_argument("--record", action="append", default=[], metavar="FOLDER",
                         help="a run record: its certificate, and its policy too")  # fmt: skip
     parser.add_argument("--states", type=int, default=DEFAULT_STATES,
@@ -342,13 +399,13 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _label(certificate: Certificate, task: str) -> str:
+def _label(certificate: Certificate, task: Task) -> str:
     if certificate.policy is not None:
         return record_label(certificate.policy)
-    return f"{certificate.name} {task}"
+    return f"{certificate.name} {name_of(task)}"
 
 
-def _d_min(task: str) -> float:
+def _d_min(task: Task) -> float:
     envs = falsification.make_simulator(task, 1)
     d_min = float(envs.d_min)
     envs.close()

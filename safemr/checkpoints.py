@@ -23,7 +23,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -32,23 +32,30 @@ import torch
 from safemr import atomic, provenance, records
 from safemr.errors import UserError, tell
 from safemr.locks import ProcessLock
+from safemr.signals import StopSignals
 
 CHECKPOINT, ATTEMPTS, LOCK = "checkpoint.pt", "attempts.jsonl", "lock"
 SHARE = 0.02  # the largest share of the run time that checkpoints may take
-_ARRAY = "ndarray"  # the key that marks an encoded NumPy array
+# Of checkpoint files: those before 2 did not keep the order of arrays in memory.
+FORMAT, _FORMAT_KEY = 2, "format"
+_ARRAY = "numpy.ndarray"  # the key that marks an encoded NumPy array
 
 
 def encode(value: Any, where: str = "state") -> Any:
     """Nested containers of arrays and plain values as what ``torch.load(weights_only=True)`` reads.
 
-    NumPy arrays become tensors that share their memory, under a marking key; tensors that show a
-    part of a larger memory are copied, because torch saves the memory and not the part.
+    NumPy arrays become tensors that share their memory, under a marking key. The order of an array
+    or tensor in memory is part of the state, because products round differently in another order:
+    strides are kept. What shows a part of a larger memory is copied, densely and in the order of
+    its axes, because torch saves the memory and not the part.
 
     Raises:
         TypeError: naming the entry that is neither an array nor a plain value.
     """
     if isinstance(value, np.ndarray):
-        return {_ARRAY: torch.from_numpy(np.ascontiguousarray(value)), "shape": list(value.shape)}
+        if any(stride < 0 or stride % value.itemsize for stride in value.strides):
+            value = np.array(value)  # torch has no such strides
+        return {_ARRAY: _dense(torch.from_numpy(value))}
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):
@@ -57,17 +64,23 @@ def encode(value: Any, where: str = "state") -> Any:
         items = (encode(item, f"{where}[{index}]") for index, item in enumerate(value))
         return type(value)(items)
     if isinstance(value, torch.Tensor):
-        return value if value.untyped_storage().nbytes() == value.nbytes else value.clone()
+        return _dense(value)
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     raise TypeError(f"{where} is a {type(value).__name__}, which a checkpoint cannot hold")
 
 
+def _dense(tensor: torch.Tensor) -> torch.Tensor:
+    """The tensor, or a copy that keeps its axes' order, where its memory holds more than it."""
+    whole = tensor.untyped_storage().nbytes() == tensor.nbytes
+    return tensor if whole else tensor.clone(memory_format=torch.preserve_format)
+
+
 def decode(value: Any) -> Any:
     """The inverse of `encode`."""
     if isinstance(value, dict):
-        if value.keys() == {_ARRAY, "shape"}:
-            return value[_ARRAY].numpy().reshape(value["shape"])
+        if value.keys() == {_ARRAY}:
+            return value[_ARRAY].numpy()
         return {key: decode(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return type(value)(decode(item) for item in value)
@@ -77,7 +90,7 @@ def decode(value: Any) -> Any:
 def save(path: Path, content: Mapping[str, Any]) -> None:
     """Write a checkpoint as a whole and durably; after a failure the previous one is untouched."""
     with atomic.replacing(path) as stream:
-        torch.save(encode(content), stream)
+        torch.save({_FORMAT_KEY: FORMAT, **encode(content)}, stream)
 
 
 def load(path: Path) -> dict[str, Any]:
@@ -89,6 +102,8 @@ def load(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} is not a readable checkpoint: {reason}") from error
     if not isinstance(content, dict):
         raise UserError(f"{path} is not a checkpoint of a run")
+    if content.pop(_FORMAT_KEY, 1) != FORMAT:
+        raise UserError(f"{path} was written by another version of this program")
     return content
 
 
@@ -113,6 +128,9 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         minimum_interval: Seconds between checkpoints at least; they are rarer where writing one
             takes long: one is due when, at the mean cost of those before, all of them together
             stay within 2% of the time.
+        signals: The handlers of a program that has its own; otherwise the session installs them.
+            A signal ends what has not begun to train at once, what trains with a checkpoint at the
+            next log point, and has no effect on a run that is recorded.
 
     Attributes:
         folder: The record's folder.
@@ -129,6 +147,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         wait: bool = False,
         die_with_parent: bool = False,
         minimum_interval: float = 60.0,
+        signals: StopSignals | None = None,
     ) -> None:
         self.config, self.variant = config, variant
         self.digest = records.config_digest(config)
@@ -139,19 +158,26 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         self._wait, self._minimum_interval = wait, minimum_interval
         self._lock = ProcessLock(self.work / LOCK, f"trains the run {self.digest}")
         self._parent = os.getppid() if die_with_parent else None
-        self._signal: signal.Signals | None = None
-        self._handlers: dict[signal.Signals, Any] = {}
+        self._signals = signals or StopSignals()
+        self._own_signals = signals is None
+        self._opened = contextlib.ExitStack()
         self._earlier = {"wall_s": 0.0, "cpu_s": 0.0}
         self._started = time.monotonic()
         self._due = self._started + minimum_interval
         self._costs: list[float] = []  # seconds of each checkpoint written
+        self._saved = 0  # the step of the last checkpoint
 
     def __enter__(self) -> Self:
-        self._lock.acquire(wait=self._wait)
-        self._remove_temporary_files()
-        self.complete = records.is_complete(self.folder)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._handlers[number] = signal.signal(number, self._note_signal)
+        with contextlib.ExitStack() as opened:
+            if self._own_signals:
+                opened.enter_context(self._signals)
+            self._lock.acquire(wait=self._wait, while_waiting=self._stop_waiting)
+            opened.callback(self._lock.release)
+            self._remove_temporary_files()
+            self.complete = records.is_complete(self.folder)
+            if self.complete:
+                self._signals.ignore()
+            self._opened = opened.pop_all()
         return self
 
     def __exit__(
@@ -160,11 +186,9 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
-        if self.complete:
-            shutil.rmtree(self.work, ignore_errors=True)
-        self._lock.release()
+        with self._opened:
+            if self.complete:
+                shutil.rmtree(self.work, ignore_errors=True)
 
     def resume(self) -> dict[str, Any] | None:
         """The trainer state of the last checkpoint, or None where the run starts from nothing."""
@@ -178,8 +202,10 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
             except (UserError, KeyError, TypeError, ValueError) as error:
                 content = None
                 tell(f"warning: starting again from step 0: {error}")
-        step = int(self.rows[-1]["step"]) if self.rows else 0
-        self._note({"started": provenance.now(), "step": step, **provenance.source_revision()})
+        self._saved = self._step()
+        started = {"started": provenance.now(), "step": self._saved}
+        self._note({**started, **provenance.source_revision()})
+        self._signals.defer()
         return content["state"] if content else None
 
     def fail(self, reason: str) -> None:
@@ -202,21 +228,23 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
 
     def maybe_checkpoint(self, state: Callable[[], Mapping[str, Any]]) -> None:
         """Save ``state()`` when one is due or the process was told to stop; in that case exit."""
-        reason = self._reason_to_stop()
         begun = time.monotonic()
-        if reason is None and begun < self._due:
+        if self._reason_to_stop() is None and begun < self._due:
             return
         with self._survive_full_disk("checkpoint"):
             content = {"rows": self.rows, "elapsed": self.elapsed(), "state": state()}
             save(self.work / CHECKPOINT, content)
+            self._saved = self._step()
         ended = time.monotonic()
         self._costs.append(ended - begun)
         with_next = sum(self._costs) * (1 + 1 / len(self._costs))
         self._due = max(ended + self._minimum_interval, self._started + with_next / SHARE)
+        reason = self._reason_to_stop()  # also one that came while the checkpoint was written
         if reason is not None:
-            step = int(self.rows[-1]["step"]) if self.rows else 0
-            tell(f"stopped by {reason} at step {step}; the same command continues here")
-            raise SystemExit(128 + (self._signal or signal.SIGTERM))
+            step = self._step()
+            here = "here" if self._saved == step else f"at step {self._saved}"
+            tell(f"stopped by {reason} at step {step}; the same command continues {here}")
+            raise SystemExit(128 + (self._signals.received or signal.SIGTERM))
 
     def finish(self, policy: Mapping[str, np.ndarray] | None) -> None:
         """Write the record, provenance last, and remove everything unfinished."""
@@ -236,6 +264,10 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
                 "kept: make room and repeat the command"
             ) from error
         self.complete = True
+        self._signals.ignore()
+
+    def _step(self) -> int:
+        return int(self.rows[-1]["step"]) if self.rows else 0
 
     def _note(self, event: Mapping[str, Any]) -> None:
         label = f"{self.variant} {self.config['task']['name']} seed {self.config['seed']}"
@@ -244,20 +276,21 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
             stream.write("\n" + json.dumps({"run": label, **event}))
 
     def _reason_to_stop(self) -> str | None:
-        if self._signal is not None:
-            return self._signal.name
+        if self._signals.received is not None:
+            return self._signals.received.name
         if self._parent is not None and os.getppid() != self._parent:
             return "the end of its parent process"
         return None
 
-    def _note_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._signal is not None:  # the second one means it
-            raise SystemExit(128 + number)
-        self._signal = signal.Signals(number)
+    def _stop_waiting(self) -> None:
+        """An orphan gives up its place in the queue; a signal raises by itself."""
+        if (reason := self._reason_to_stop()) is not None:
+            tell(f"stopped by {reason} while it waited")
+            raise SystemExit(128 + signal.SIGTERM)
 
     def _remove_temporary_files(self) -> None:
         for folder in (self.work, self.folder):
-            for leftover in folder.glob("*.tmp"):
+            for leftover in folder.glob(".*.tmp"):
                 leftover.unlink(missing_ok=True)
 
     @contextlib.contextmanager

@@ -18,8 +18,10 @@ import numpy as np
 import pandas as pd
 
 from safemr import reference, statistics
+from safemr.conventions import COVERS
 from safemr.convergence import certificate_settles_last, losses_bounded
 from safemr.evidence import (
+    NO_INTERVAL,
     NOTHING,
     Evidence,
     Finding,
@@ -27,6 +29,8 @@ from safemr.evidence import (
     at_most,
     by_interval,
     describe,
+    has_interval,
+    not_run,
     on_every_task,
     overall,
     surely_below,
@@ -36,7 +40,6 @@ from safemr.statistics import Estimate
 from safemr.tables import Table, best_safe_baseline
 
 COLUMNS = ["estimate", "low", "high", "count"]
-COVERS = 0.01  # a certificate covers the true unsafe set if it misses at most this share of it
 
 
 @dataclass(frozen=True)
@@ -56,9 +59,9 @@ class Claim:
 def smaller_than_joint_sis(evidence: Evidence) -> Finding:
     """Volume of JointSIS's unsafe set minus SafeMR's, in units of the true one: Welch, above 0."""
     names = ("JointSIS", reference.METHOD)
-    absent = evidence.missing_flights(names)
+    absent = evidence.lacking_flights(names)
     if absent:
-        return unavailable(absent)
+        return absent
     volumes = [evidence.measured(variant, "volume_ratio") for variant in names]
     gap = statistics.difference_interval(volumes[0], volumes[1])
     return by_interval(gap, 0.0, "JointSIS - SafeMR")
@@ -66,18 +69,20 @@ def smaller_than_joint_sis(evidence: Evidence) -> Finding:
 
 def covers_true_set(evidence: Evidence) -> Finding:
     """Missed share of SafeMR: confirmed if its interval is at or below 1%, refuted if above."""
-    absent = evidence.missing_flights([reference.METHOD])
+    absent = evidence.lacking_flights([reference.METHOD])
     if absent:
-        return unavailable(absent)
+        return absent
     missed = evidence.measured(reference.METHOD, "missed_share")
-    return at_most(statistics.mean_interval(missed), COVERS, "missed share")
+    estimate = statistics.mean_interval(missed, bounds=(0.0, 1.0))
+    return at_most(estimate, COVERS, "missed share")
 
 
 def handcrafted_does_not_cover(evidence: Evidence) -> Finding:
     """Missed share of phi_h, a fixed function without seeds: confirmed if above 1%."""
     missed = evidence.measured("phi_h", "missed_share")
     if not len(missed):
-        return unavailable("aircraft measurements of phi_h")
+        what = "aircraft measurements of phi_h"
+        return unavailable(what) if _asks_for_flights(evidence) else not_run(what)
     value = float(missed.mean())
     verdict: Verdict = "confirmed" if value > COVERS else "refuted"
     return Finding(Estimate(value, value, value, 1), verdict, f"missed share {value:.3f}, computed")
@@ -93,17 +98,20 @@ def highest_safe_return(task: str, evidence: Evidence) -> Finding:
     claim holds as soon as SafeMR is safe.
     """
     baselines = reference.BASELINES
-    absent = evidence.missing([(task, v) for v in (reference.METHOD, *baselines)])
+    absent = evidence.lacking(task, (reference.METHOD, *baselines))
     if absent:
-        return unavailable(absent)
+        return absent
     ours = evidence.of(task, reference.METHOD, "eval_return")
     if not evidence.rule.is_safe(evidence.scores, task, reference.METHOD):
-        cost = statistics.mean_interval(evidence.of(task, reference.METHOD, evidence.rule.cost))
+        cost = evidence.interval(task, reference.METHOD, evidence.rule.cost)
         return Finding(NOTHING, "refuted", f"SafeMR is not safe: {describe(cost)} violating steps")
     best, returns = best_safe_baseline(evidence.scores, task, evidence.rule, baselines)
     if not best:
-        own = describe(statistics.mean_interval(ours))
-        return Finding(NOTHING, "confirmed", f"no baseline is safe; SafeMR returns {own}")
+        own = statistics.mean_interval(ours)
+        shown = f"no baseline is safe; SafeMR returns {describe(own)}"
+        if own.size < statistics.FEWEST_RUNS:
+            return Finding(NOTHING, "inconclusive", f"{shown}: {NO_INTERVAL}")
+        return Finding(NOTHING, "confirmed", shown)
     gap = statistics.difference_interval(ours, returns)
     return by_interval(gap, 0.0, f"SafeMR - {best}")
 
@@ -111,14 +119,16 @@ def highest_safe_return(task: str, evidence: Evidence) -> Finding:
 def zero_violations(evidence: Evidence) -> Finding:
     """Share of final evaluation episodes without any violation, SafeMR, each task.
 
-    Confirmed if it is 1 in every seed (none observed; not a proof), else refuted: one violation
-    contradicts zero, whatever the interval of the share.
+    Confirmed if it is 1 in every seed of three or more (none observed; not a proof), refuted by
+    one violation: it contradicts zero, whatever the interval of the share.
     """
 
     def judge(task: str) -> Finding:
         shares = evidence.of(task, reference.METHOD, evidence.rule.clean)
-        estimate = statistics.mean_interval(shares)
+        estimate = evidence.interval(task, reference.METHOD, evidence.rule.clean)
         shown = f"clean share {describe(estimate)}"
+        if (shares == 1).all() and len(shares) < statistics.FEWEST_RUNS:
+            return Finding(estimate, "inconclusive", f"{shown}: {NO_INTERVAL}")
         if (shares == 1).all():
             return Finding(estimate, "confirmed", f"{shown}, no violation observed")
         seeds = f"violations in {(shares != 1).sum()} of {len(shares)} seeds"
@@ -136,12 +146,12 @@ def unsafe_everywhere(variant: str, evidence: Evidence) -> Finding:
     rule = evidence.rule
 
     def judge(task: str) -> Finding:
-        cost = statistics.mean_interval(evidence.of(task, variant, rule.cost))
-        clean = statistics.mean_interval(evidence.of(task, variant, rule.clean))
+        cost = evidence.interval(task, variant, rule.cost)
+        clean = evidence.interval(task, variant, rule.clean)
         shown = f"{describe(cost)} violating steps, clean share {describe(clean)}"
         if rule.is_safe(evidence.scores, task, variant):
             return Finding(cost, "refuted", f"{shown}: safe")
-        if cost.low > rule.tolerance:
+        if has_interval(cost) and cost.low > rule.tolerance:
             return Finding(cost, "confirmed", f"{shown}: the steps decide")
         if surely_below(clean, rule.clean_share):
             return Finding(cost, "confirmed", f"{shown}: the share decides")
@@ -174,7 +184,7 @@ def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding
         if not evidence.rule.is_safe(evidence.scores, task, variant):
             if somewhere:
                 return None
-            cost = statistics.mean_interval(evidence.of(task, variant, evidence.rule.cost))
+            cost = evidence.interval(task, variant, evidence.rule.cost)
             reason = f"{variant} is not safe: {describe(cost)} violating steps"
             return Finding(NOTHING, "refuted", reason)
         returns = [evidence.of(task, name, "eval_return") for name in names]
@@ -192,7 +202,7 @@ def points_beat_joint_sis(evidence: Evidence) -> Finding:
     task = reference.SENSITIVITY_TASK
     absent = _missing_points(evidence, (*evidence.points, "JointSIS"))
     if absent:
-        return unavailable(absent)
+        return absent
     baseline = evidence.of(task, "JointSIS", "eval_return")
     return overall(
         {
@@ -209,14 +219,12 @@ def point_costs_vanish(evidence: Evidence) -> Finding:
     """For every [a, b]: violating steps of the final policy at most the tolerance, by interval."""
     absent = _missing_points(evidence, tuple(evidence.points))
     if absent:
-        return unavailable(absent)
+        return absent
     rule = evidence.rule
     return overall(
         {
             f"[{a:g}, {b:g}]": at_most(
-                statistics.mean_interval(
-                    evidence.of(reference.SENSITIVITY_TASK, variant, rule.cost)
-                ),
+                evidence.interval(reference.SENSITIVITY_TASK, variant, rule.cost),
                 rule.tolerance, "violating steps",
             )
             for variant, (a, b) in evidence.points.items()
@@ -230,8 +238,7 @@ def point_costs_vanish(evidence: Evidence) -> Finding:
 def parameters_feasible(group: str, evidence: Evidence) -> Finding:
     """No searched state lacks a safe action, for every certificate of a group.
 
-    The group is the paper's ("paper") or a variant's at every point [a, b].
-
+    The group is the paper's ("paper") or a variant's at every point [a, b], on the paper's tasks.
 
     Feasible means that the safe action set is nonempty at every state, so one replayable state
     without a safe action refutes it; a search that finds none leaves it unrefuted, and then the
@@ -243,8 +250,11 @@ def parameters_feasible(group: str, evidence: Evidence) -> Finding:
     rows = evidence.certificates
     if rows is not None:
         rows = rows[[_belongs(name, group) for name in rows["certificate"]]]
+        rows = rows[rows["task"].isin(evidence.tasks)]
     if rows is None or rows.empty:
-        return unavailable(f"certify results of {group}")
+        what = f"certify results of {group}"
+        asked = group != "paper" and evidence.asks_for((task, group) for task in evidence.tasks)
+        return unavailable(what) if asked or evidence.expected is None else not_run(what)
     worst = rows.sort_values("worst_margin").iloc[-1]
     share = float(rows["infeasible_share"].max())
     estimate = Estimate(float(worst["worst_margin"]), np.nan, np.nan, len(rows))
@@ -388,7 +398,8 @@ def claims_table(evidence: Evidence) -> Table:
     )  # fmt: skip
     caption = (
         "Claims of the paper and what these runs say of them, by rules of which docs/claims.md "
-        "says which were changed or added after the first reported run. "
+        "says which were changed or added after the first reported run. Not run: nothing that the "
+        "claim is about, a task with the paper's settings, is in this configuration. "
         f"{str(evidence.rule).capitalize()}."
     )
     return Table("claims", caption, data, display)
@@ -400,8 +411,20 @@ def _belongs(certificate: str, group: str) -> bool:
     return label == group or label.startswith((f"{group} [", f"{group}["))
 
 
-def _missing_points(evidence: Evidence, variants: Sequence[str]) -> str:
+def _asks_for_flights(evidence: Evidence) -> bool:
+    expected = evidence.expected
+    return expected is None or bool((expected["task"] == reference.AIRCRAFT_TASK).any())
+
+
+def _missing_points(evidence: Evidence, variants: Sequence[str]) -> Finding | None:
+    """The finding where runs of the points are missing, or none is of the paper's task."""
+    task = reference.SENSITIVITY_TASK
+    if evidence.expected is not None and not (
+        evidence.points and evidence.asks_for((task, v) for v in evidence.points)
+    ):
+        return not_run(f"the points [a, b] on {task}")
     unknown = [p for p in reference.TABLE_II if p not in evidence.points.values()]
     texts = [f"SafeMR with [a, b] = [{a:g}, {b:g}]" for a, b in unknown]
     texts.append(evidence.missing((reference.SENSITIVITY_TASK, v) for v in variants))
-    return "; ".join(text for text in texts if text)
+    missing = "; ".join(text for text in texts if text)
+    return unavailable(missing) if missing else None

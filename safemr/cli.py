@@ -4,6 +4,7 @@ safemr train ...      train one run (`python -m safemr.train`)
 safemr evaluate ...   evaluate a recorded policy (`python -m safemr.evaluate`)
 safemr certify ...    check a learned energy function (`python -m safemr.certify`)
 safemr records ...    verify the records under a results root and say what is unfinished
+safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
 """
 
@@ -14,8 +15,8 @@ import importlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
-from safemr.config import unknown
 from safemr.errors import UserError
+from safemr.names import unknown
 
 # Command -> module with main(arguments) -> exit status, imported only when it is called.
 COMMANDS = {
@@ -23,6 +24,7 @@ COMMANDS = {
     "evaluate": "safemr.evaluate",
     "certify": "safemr.certify",
     "records": "safemr.inspection",
+    "list": "safemr.listing",
     "config": "safemr.config",
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from safemr import statistics
-from safemr.tables import Table, entries, missing_notes, plus_minus
+from safemr.tables import FEW, Table, entries, missing_notes, plus_minus
 
 
 def differences(
@@ -41,7 +41,7 @@ def differences(
     display = pd.DataFrame(lines, columns=["task", "algorithm", *columns[:-1]]).fillna("")
     caption = (
         f"Returns in {source}, compared in pairs: the row's minus the column's, mean over seeds ± "
-        "half width of Welch's 95% interval. †: the interval does not contain 0. Not corrected for "
-        "the number of pairs, and whether an algorithm is safe is not asked here."
+        f"half width of Welch's 95% interval. {FEW} †: the interval does not contain 0. Not "
+        "corrected for the number of pairs, and whether an algorithm is safe is not asked here."
     )
     return Table(name, caption, data, display, missing_notes(missing, None, None))

@@ -10,12 +10,14 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
 from safemr.errors import UserError
+from safemr.names import unknown
 from safemr.strict_yaml import read_yaml, show, typed
 
 FAMILIES = ("off_policy", "on_policy")
@@ -23,8 +25,12 @@ WANDB_MODES = ("disabled", "offline", "online")
 LARGEST_SEED = 2**31 - 1
 LARGEST_COUNT = 10**10
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]{0,59}")
-_ROOT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
-_SOURCES = {"benchmarks", "config", "docs", "envs", "profiles", "safemr", "tests", "workflow"}
+_ROOT = re.compile(r"(/|(\.\./)*)[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+_REPOSITORY = Path(__file__).resolve().parents[1]
+_SOURCES = {
+    *("benchmarks", "config", "docs", "envs", "examples", "profiles", "safemr", "tests"),
+    "workflow",
+}
 
 
 @dataclass(frozen=True)
@@ -46,8 +52,19 @@ class Outside:
 
 
 @dataclass(frozen=True)
+class TaskVariant:
+    """A task with a name of its own: a registered one with other settings."""
+
+    base: str
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class TaskOverrides:
-    """What differs on one task, for all algorithms of a family alike."""
+    """What differs on one task, for all algorithms of a family alike.
+
+    ``settings`` are those of its simulation; others make another task, which `TaskVariant` names.
+    """
 
     settings: Mapping[str, Any]
     budget: Mapping[str, int]
@@ -101,6 +118,7 @@ class Config:
     """A validated configuration; see config/config.yaml for the meaning of each key."""
 
     tasks: tuple[str, ...]
+    task_variants: Mapping[str, TaskVariant]  # of those tasks that are not registered ones
     algorithms: Mapping[str, Variant]
     seeds: tuple[int, ...]
     budget: Mapping[str, int]
@@ -141,11 +159,13 @@ def parse(raw: Any) -> Config:
     evaluation = _Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
     wandb = _Section(top.get("wandb", {}), "wandb", ("mode", "project"))
     safe = _Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
+    tasks = _tasks(top.required("tasks"), "tasks")
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
         raise unknown("wandb mode", mode, WANDB_MODES)
     config = Config(
-        tasks=_names(top.required("tasks"), "tasks"),
+        tasks=tuple(tasks),
+        task_variants={name: variant for name, variant in tasks.items() if variant},
         algorithms=_variants(top.required("algorithms"), "algorithms"),
         seeds=_seeds(top.required("seeds"), "seeds"),
         budget=_budget(top.required("budget"), "budget"),
@@ -153,7 +173,7 @@ def parse(raw: Any) -> Config:
         evaluation=Evaluation(
             _integer(evaluation.required("points"), "evaluation.points", 1),
             _integer(evaluation.required("episodes"), "evaluation.episodes", 1),
-            _integer(evaluation.get("seed", 10_000), "evaluation.seed", 0, LARGEST_SEED),
+            _integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
         ),
         unseen_layouts=_unseen(top.get("unseen_layouts")),
         task_overrides={
@@ -171,9 +191,11 @@ def parse(raw: Any) -> Config:
         allow_missing=_flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
         wandb_project=_name(wandb.get("project", "safemr"), "wandb.project"),
-        cost_tolerance=_number(safe.get("cost_tolerance", 1.0), "safe.cost_tolerance", 0, math.inf),
+        cost_tolerance=_number(
+            safe.get("cost_tolerance", COST_TOLERANCE), "safe.cost_tolerance", 0, math.inf
+        ),
         zero_violation_share=_number(
-            safe.get("zero_violation_share", 0.95), "safe.zero_violation_share", 0, 1
+            safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
     )
     if config.log_points % config.evaluation.points:
@@ -187,15 +209,6 @@ def parse(raw: Any) -> Config:
     if config.sensitivity and config.sensitivity.variant not in config.algorithms:
         raise unknown("sensitivity.algorithm", config.sensitivity.variant, config.algorithms)
     return config
-
-
-def unknown(kind: str, name: Any, known: Iterable[str], where: str = "") -> UserError:
-    """The error for a name that does not exist, with the nearest one that does."""
-    names = sorted(known)
-    close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
-    listing = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-    remedy = f"did you mean {close[0]!r}?" if close else f"there is {listing or 'none'}"
-    return UserError(f"unknown {kind} {show(name)}{' in ' + where if where else ''}; {remedy}")
 
 
 _TOP_LEVEL = (
@@ -272,10 +285,50 @@ def _name(value: Any, where: str) -> str:
     return value
 
 
-def _names(value: Any, where: str) -> tuple[str, ...]:
-    names = tuple(_name(item, f"each of {where}") for item in _list(value, where))
-    _distinct(names, where)
-    return names
+def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
+    """Names of tasks, and what each is where it is no registered one.
+
+    A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
+    mapping of all names, those of registered tasks with nothing behind them.
+    """
+    entries: list[tuple[Any, Any]] = []
+    if isinstance(value, Mapping):
+        entries += value.items()
+        if not entries:
+            raise UserError(f"{where} is empty")
+    else:
+        for item in _list(value, where):
+            if isinstance(item, Mapping) and len(item) != 1:
+                raise UserError(
+                    f"each of {where} must be a name or one NAME: {{base, settings}}, "
+                    f"not {show(item)}"
+                )
+            entries += item.items() if isinstance(item, Mapping) else [(item, None)]
+    names = [_name(name, f"each of {where}") for name, _ in entries]
+    _distinct([name.lower() for name in names], where)
+    return {
+        name: _task_variant(entry, f"{where}.{name}")
+        for name, (_, entry) in zip(names, entries, strict=True)
+    }
+
+
+def _task_variant(value: Any, where: str) -> TaskVariant | None:
+    if value is None or value == {}:
+        return None
+    section = _Section(value, where, ("base", "settings"))
+    return TaskVariant(
+        _name(section.required("base"), f"{where}.base"),
+        _mapping(section.required("settings"), f"{where}.settings"),
+    )
+
+
+def task_name(value: Any, where: str) -> str:
+    """A name that a task may have.
+
+    Raises:
+        UserError: for anything else.
+    """
+    return _name(value, where)
 
 
 def _integer(value: Any, where: str, low: int, high: int = LARGEST_COUNT) -> int:
@@ -347,7 +400,7 @@ def _unseen(value: Any) -> UnseenLayouts | None:
     section = _Section(value, "unseen_layouts", ("episodes", "seed"))
     return UnseenLayouts(
         _integer(section.required("episodes"), "unseen_layouts.episodes", 1),
-        _integer(section.get("seed", 20_000), "unseen_layouts.seed", 0, LARGEST_SEED),
+        _integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
     )
 
 
@@ -394,14 +447,24 @@ def _outside(value: Any, where: str) -> Outside:
 def _root(value: Any, where: str) -> Path:
     if not isinstance(value, str) or not _ROOT.fullmatch(value):
         raise UserError(
-            f"{where} must be a relative path of plain names (no '..', no hidden folder), "
-            f"not {show(value)}"
+            f"{where} must be a path of plain names, from here, from above (../) or from / "
+            f"(no hidden folder, no '..' but at the start), not {show(value)}"
         )
-    if Path(value).parts[0] in _SOURCES:
+    path = Path(value)
+    place = path.resolve()
+    if path.parts[0] in _SOURCES or _among_sources(place):
         raise UserError(f"{where} = {value!r} lies among the sources; choose another folder")
-    if Path(value).exists() and not Path(value).is_dir():
+    if place in (_REPOSITORY, *_REPOSITORY.parents, Path.cwd(), *Path.cwd().parents):
+        raise UserError(f"{where} = {value!r} contains the repository; choose a folder beside it")
+    if path.exists() and not path.is_dir():
         raise UserError(f"{where} = {value!r} is a file; choose a folder")
-    return Path(value)
+    return path
+
+
+def _among_sources(place: Path) -> bool:
+    inside = place.is_relative_to(_REPOSITORY)
+    first = place.relative_to(_REPOSITORY).parts[:1] if inside else ()
+    return any(name in _SOURCES or name.startswith(".") for name in first)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -21,12 +20,12 @@ from numpy.typing import NDArray
 from safemr import reference
 from safemr.evaluate import evaluate
 from safemr.measurements import Measurements
-from safemr.point_robot import PointRobot
-from safemr.runs import describe_task
+from safemr.point_robot import ROBOT
+from safemr.runs import installed
+from safemr.tasks import Task, make_envs, name_of, traits
 
 Array = NDArray[np.float64]
 
-ROBOT = PointRobot()
 SCORE_COLUMNS = ["task", "variant", "seed", "metric", "value"]
 CRUISE = 1.0  # m/s on the way
 PUSH_SPEED = 0.5  # m/s while pushing; faster loses the box
@@ -121,60 +120,65 @@ class Pusher(VelocityController):
         return min(CRUISE, 1.5 * max(distance - 0.03, 0.0)) * gap / max(distance, 1e-9)
 
 
-CONTROLLERS: Mapping[str, Mapping[str, Callable[[Any], VelocityController]]] = {
-    "Goal": {"scripted: ignores obstacles": GoalSeeker},
-    "Push": {"scripted: touches the box": BoxToucher, "scripted: pushes the box": Pusher},
-}
+Controllers = Mapping[str, Callable[[Any], VelocityController]]
+
+TO_THE_GOAL: Controllers = {"scripted: ignores obstacles": GoalSeeker}
+WITH_THE_BOX: Controllers = {
+    "scripted: touches the box": BoxToucher, "scripted: pushes the box": Pusher
+}  # fmt: skip
+
+
+def controllers_of(envs: Any) -> Controllers:
+    """Those that can act in these environments; none without the point robot."""
+    has = traits(envs)
+    if not has.point_robot:
+        return {}
+    return WITH_THE_BOX if has.pushes_box else TO_THE_GOAL
 
 
 def controller_scores(
-    tasks: Sequence[str] = reference.TASKS,
+    tasks: Sequence[Task] = reference.TASKS,
     *,
     seeds: Sequence[int] = (0, 1, 2, 3, 4),
     episodes: int = 20,
-    settings: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> pd.DataFrame:
     """Score table (task, variant, seed, metric, value) of the controllers that fit each task.
 
-    A seed is one evaluation of `episodes` layouts of its own. settings: task -> settings of its
-    environment. Tasks of other kinds give no rows.
+    A seed is one evaluation of `episodes` layouts of its own. Tasks without the point robot give
+    no rows.
     """
     rows = []
     for task in tasks:
-        for name, controller in CONTROLLERS.get(task.rsplit("-", 1)[-1], {}).items():
-            envs = gymnasium.make_vec(
-                f"envs:{task}-v0", episodes, vectorization_mode="vector_entry_point",
-                **(settings or {}).get(task, {}),
-            )  # fmt: skip
+        envs = make_envs(task, episodes)
+        for name, controller in controllers_of(envs).items():
             for seed in seeds:
                 # Layouts apart from those of the runs' evaluations, and of each other.
                 scores = evaluate(controller(envs), envs, 1_000_000 + seed * episodes)
-                rows += [(task, name, seed, f"eval_{key}", value) for key, value in scores.items()]
-            envs.close()
+                rows += [
+                    (name_of(task), name, seed, f"eval_{key}", value)
+                    for key, value in scores.items()
+                ]
+        envs.close()
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)
 
 
 def measured_scores(
     measurements: Measurements,
-    tasks: Sequence[str],
+    tasks: Sequence[Task],
     *,
     seeds: int,
     episodes: int,
-    settings: Mapping[str, Mapping[str, Any]],
 ) -> pd.DataFrame:
     """`controller_scores` for seeds 0 to ``seeds`` - 1, kept task by task."""
     rows: list[dict[str, Any]] = []
     for task in tasks:
-        described = describe_task(task, settings.get(task, {}))
-        inputs = {"task": described, "seeds": seeds, "episodes": episodes}
+        inputs = {"task": installed(task), "seeds": seeds, "episodes": episodes}
 
-        def measure(task: str = task) -> Any:
-            scores = controller_scores(
-                (task,), seeds=range(seeds), episodes=episodes, settings=settings
-            )
+        def measure(task: Task = task) -> Any:
+            scores = controller_scores((task,), seeds=range(seeds), episodes=episodes)
             return scores.to_dict("records")
 
-        rows += measurements.rows("controllers", task, inputs, measure)
+        rows += measurements.rows("controllers", name_of(task), inputs, measure)
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)
 
 

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from safemr.conventions import UNSEEN_SEED
 from safemr.episodes import EpisodeStatistics
 from safemr.errors import UserError
 
 if TYPE_CHECKING:
     from safemr.measurements import Measurements
 
-SEED = 20_000  # apart from the layouts of the runs' own evaluations
 EPISODES = 100
 
 
@@ -52,7 +52,7 @@ def evaluate(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> 
 
 
 def evaluate_record(
-    folder: Path, *, episodes: int = EPISODES, seed: int = SEED, deterministic: bool = True
+    folder: Path, *, episodes: int = EPISODES, seed: int = UNSEEN_SEED, deterministic: bool = True
 ) -> dict[str, float]:
     """A record's final policy on ``episodes`` layouts of its task: `evaluate`, and ``return_sd``.
 
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("records", type=Path, nargs="+", metavar="RECORD", help="its folder")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="one layout each")
-    parser.add_argument("--seed", type=int, default=SEED, help="of the first layout")
+    parser.add_argument("--seed", type=int, default=UNSEEN_SEED, help="of the first layout")
     parser.add_argument("--exploring", action="store_true", help="sample the actions")
     options = parser.parse_args(arguments)
     if options.episodes < 1 or options.seed < 0:

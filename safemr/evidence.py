@@ -13,8 +13,9 @@ from safemr import reference, statistics
 from safemr.statistics import Estimate
 from safemr.tables import SafetyRule, describe_missing
 
-Verdict = Literal["confirmed", "refuted", "inconclusive"]
+Verdict = Literal["confirmed", "refuted", "inconclusive", "not run"]
 
+NO_INTERVAL = "too few seeds for an interval"
 NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
 
 
@@ -76,6 +77,33 @@ class Evidence:
                 texts.append(describe_missing(absent))
         return "; ".join(texts)
 
+    def asks_for(self, pairs: Iterable[tuple[str, str]]) -> bool:
+        """Whether the configured grid has any of these (task, variant) pairs."""
+        if self.expected is None:
+            return True
+        asked = set(zip(self.expected["task"], self.expected["variant"], strict=True))
+        return any(pair in asked for pair in pairs)
+
+    def lacking(self, task: str, variants: Sequence[str]) -> Finding | None:
+        """The finding where runs on a task are missing, or are none of the grid's."""
+        pairs = [(task, variant) for variant in variants]
+        if not self.asks_for(pairs):
+            return not_run(f"{', '.join(variants)} on {task}")
+        absent = self.missing(pairs)
+        return unavailable(absent) if absent else None
+
+    def lacking_flights(self, variants: Sequence[str]) -> Finding | None:
+        """The finding where the aircraft comparison lacks runs of these learners."""
+        pairs = [(reference.AIRCRAFT_TASK, variant) for variant in variants]
+        if not self.asks_for(pairs):
+            return not_run(f"{', '.join(variants)} on {reference.AIRCRAFT_TASK}")
+        absent = self.missing_flights(variants)
+        return unavailable(absent) if absent else None
+
+    def interval(self, task: str, variant: str, metric: str) -> Estimate:
+        """Mean of final scores with its t interval, within the metric's bounds."""
+        return statistics.score_interval(self.scores, task, variant, metric)
+
     def of(self, task: str, variant: str, metric: str) -> np.ndarray:
         """[seeds] final scores."""
         return statistics.scores_of(self.scores, task, variant, metric)
@@ -100,8 +128,8 @@ class Finding:
 def by_interval(estimate: Estimate, threshold: float, what: str) -> Finding:
     """Confirmed where the interval is above the threshold, refuted where below, else open."""
     shown = f"{what} {describe(estimate)}"
-    if np.isnan(estimate.low):
-        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
+    if not has_interval(estimate):
+        return Finding(estimate, "inconclusive", f"{shown}: {NO_INTERVAL}")
     if estimate.low > threshold:
         return Finding(estimate, "confirmed", shown)
     if estimate.high < threshold:
@@ -114,7 +142,7 @@ def overall(parts: Mapping[str, Finding]) -> Finding:
 
     The estimate is that of the part that decides; the reason names every part.
     """
-    rank: dict[Verdict, int] = {"refuted": 0, "inconclusive": 1, "confirmed": 2}
+    rank: dict[Verdict, int] = {"refuted": 0, "inconclusive": 1, "not run": 1, "confirmed": 2}
     deciding = min(parts.values(), key=lambda part: rank[part.verdict])
     reason = "; ".join(f"{name}: {part.verdict}, {part.reason}" for name, part in parts.items())
     return Finding(deciding.estimate, deciding.verdict, reason)
@@ -123,8 +151,8 @@ def overall(parts: Mapping[str, Finding]) -> Finding:
 def at_most(estimate: Estimate, bound: float, what: str) -> Finding:
     """Confirmed where the whole interval is at or below the bound, refuted where it is above."""
     shown = f"{what} {describe(estimate)}"
-    if np.isnan(estimate.low):
-        return Finding(estimate, "inconclusive", f"{shown}: too few seeds for an interval")
+    if not has_interval(estimate):
+        return Finding(estimate, "inconclusive", f"{shown}: {NO_INTERVAL}")
     if estimate.high <= bound:
         return Finding(estimate, "confirmed", shown)
     if estimate.low > bound:
@@ -132,17 +160,27 @@ def at_most(estimate: Estimate, bound: float, what: str) -> Finding:
     return Finding(estimate, "inconclusive", f"{shown}: the interval contains {bound:g}")
 
 
-def surely_below(estimate: Estimate, bound: float) -> bool:
-    """Whether the interval ends below the bound; seeds that are all equal are no interval.
+def has_interval(estimate: Estimate) -> bool:
+    """Whether there is one: few seeds have none, and seeds that are all equal are none.
 
     Shares of a few episodes are coarse, so that equal values in every seed say little, but for 0.
     """
-    return bool(estimate.high < bound and (estimate.low < estimate.high or estimate.mean == 0))
+    return bool(estimate.low < estimate.high or estimate.low == estimate.high == 0)
+
+
+def surely_below(estimate: Estimate, bound: float) -> bool:
+    """Whether there is an interval and it ends below the bound."""
+    return has_interval(estimate) and estimate.high < bound
 
 
 def unavailable(what: str) -> Finding:
     """The finding of a claim whose runs are missing."""
     return Finding(NOTHING, "inconclusive", f"runs missing: {what}")
+
+
+def not_run(what: str) -> Finding:
+    """The finding of a claim about nothing that is in the configured grid."""
+    return Finding(NOTHING, "not run", f"not in this configuration: {what}")
 
 
 def on_every_task(
@@ -156,6 +194,9 @@ def on_every_task(
     So what has been run cannot confirm what the paper says of every task, but can refute it. A task
     that ``judge`` leaves out (None) has no part; ``otherwise`` refutes where all are left out.
     """
+    pairs = [(task, variant) for task in evidence.tasks for variant in variants]
+    if not evidence.asks_for(pairs):
+        return not_run(f"{', '.join(variants)} on any of the paper's tasks")
     absent = {task: evidence.missing([(task, v) for v in variants]) for task in evidence.tasks}
     if all(absent.values()):
         return unavailable("; ".join(absent.values()))

@@ -20,22 +20,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from safemr.energy import constraint, energy, largest
 from safemr.errors import UserError
 from safemr.evaluate import Acts
-from safemr.point_robot import PointRobot
+from safemr.point_robot import ROBOT
 from safemr.reference import Zeta
+from safemr.tasks import Task, base_of, make_envs, name_of, settings_of, task_settings, traits
 
 Array = NDArray[np.float64]
 Worlds = Mapping[str, NDArray[Any]]  # `envs.get_state()["worlds"]`: arrays with one row a world
 
 COLUMNS = ("distance", "bearing", "course", "speed", "turn_rate")
 FAR_AWAY = 100.0  # m, where the objects stand that play no part
-ROBOT = PointRobot()
 
 # The action grid: thrust saturates at |a0| = 0.05, so a0 is gridded inside that. The yaw torque is
 # limited too and varies only for a1 within 0.05 of 0.3 psi_dot; there a1 is gridded densely, beside
@@ -85,7 +84,7 @@ def grid_margins(states: Array, d_min: float, zeta: Zeta, eta: float) -> Array:
 class Falsification:
     """Result of a search; shares are of the sampled states, uniform in the five coordinates."""
 
-    task: str
+    task: Task
     zeta: Zeta
     eta: float
     states: Array  # [S, 5]
@@ -112,18 +111,33 @@ class Falsification:
         return float(self.infeasible[inside].mean()) if inside.any() else float("nan")
 
     def example(self) -> dict[str, Any]:
-        """The worst state as plain numbers, enough for `replay`."""
+        """The worst state as plain numbers, enough for `replay`.
+
+        What is not said of the task (base, settings) is that of the registered one.
+        """
         state = dict(zip(COLUMNS, map(float, self.worst_state), strict=True))
-        return {"task": self.task, **self.zeta._asdict(), "eta": self.eta, "state": state,
+        name, base = name_of(self.task), base_of(self.task)
+        changed = task_settings(settings_of(self.task))
+        task: dict[str, Any] = {"task": name}
+        task |= {"base": base} if base != name else {}
+        task |= {"settings": changed} if changed else {}
+        return {**task, **self.zeta._asdict(), "eta": self.eta, "state": state,
                 "margin": self.worst_margin}  # fmt: skip
 
 
 def falsify(
-    envs: Any, zeta: Zeta, *, eta: float = 0.0, count: int = 2**16, seed: int = 0, rounds: int = 12
+    envs: Any,
+    task: Task,
+    zeta: Zeta,
+    *,
+    eta: float = 0.0,
+    count: int = 2**16,
+    seed: int = 0,
+    rounds: int = 12,
 ) -> Falsification:
     """Search `count` Sobol states, refine the worst, confirm in the simulator.
 
-    envs: `make_simulator` of the task. Each round of the refinement perturbs the worst states, with
+    envs: `make_simulator` of ``task``. Each round of the refinement perturbs the worst states, with
     smaller steps than the last, and keeps what is worse. Raises UserError where phi stays positive
     far from the obstacle, so that the box of states has no end.
     """
@@ -159,7 +173,7 @@ def falsify(
     agree = (simulated >= 0) == (least(examined) >= 0)
     top = int(simulated.argmax())
     return Falsification(
-        task=envs.task.name, zeta=zeta, eta=eta, states=states, phi=energies(states, d_min, zeta),
+        task=task, zeta=zeta, eta=eta, states=states, phi=energies(states, d_min, zeta),
         margin=margin, worst_state=examined[top], worst_margin=float(simulated[top]),
         confirmed=int(agree.sum()), examined=len(examined),
     )  # fmt: skip
@@ -196,15 +210,11 @@ def overlaps_obstacle(envs: Any, states: Array) -> NDArray[np.bool_]:
 # --- the simulator -------------------------------------------------------------------------------
 
 
-def make_simulator(
-    task: str, num_envs: int = 128, settings: Mapping[str, Any] | None = None
-) -> Any:
+def make_simulator(task: Task, num_envs: int = 128) -> Any:
     """The task's batched environment. Raises UserError for a task without the point robot."""
-    envs: Any = gymnasium.make_vec(
-        f"envs:{task}-v0", num_envs, vectorization_mode="vector_entry_point", **(settings or {})
-    )
-    if "velocimeter" not in envs.observation_layout:
-        raise UserError(f"falsification needs a task of the point robot; {task} is none")
+    envs = make_envs(task, num_envs)
+    if not traits(envs).point_robot:
+        raise UserError(f"falsification needs a task of the point robot; {name_of(task)} is none")
     envs.reset(seed=0)
     return envs
 
@@ -261,10 +271,17 @@ def simulated_margins(envs: Any, states: Array, zeta: Zeta, eta: float) -> Array
     return simulated_grid(envs, worlds, states[:, 4], phi, zeta, eta)[1].min(1)
 
 
+def task_of(example: Mapping[str, Any]) -> dict[str, Any]:
+    """The task on which an example was found."""
+    name = str(example["task"])
+    base = {"base": str(example["base"])} if "base" in example else {}
+    return {"name": name, "settings": dict(example.get("settings", {})), **base}
+
+
 def replay(example: Mapping[str, Any]) -> tuple[Array, Array]:
     """Actions [A, 2] of the grid and their g [A], in the simulator, in an example's state."""
     zeta = Zeta(example["sigma"], example["k"], example["n"])
-    envs = make_simulator(str(example["task"]))
+    envs = make_simulator(task_of(example))
     states = np.array([[float(example["state"][name]) for name in COLUMNS]])
     worlds, phi = worlds_near_obstacle(envs, states), energies(states, float(envs.d_min), zeta)
     actions, g = simulated_grid(envs, worlds, states[:, 4], phi, zeta, float(example["eta"]))
@@ -296,7 +313,7 @@ class PolicyCheck:
 
 def check_policy(
     policy: Acts,
-    task: str,
+    task: Task,
     zeta: Zeta,
     *,
     eta: float = 0.0,
@@ -304,13 +321,12 @@ def check_policy(
     steps: int = 1000,
     seed: int = 0,
     limit: int = 256,
-    settings: Mapping[str, Any] | None = None,
 ) -> PolicyCheck:
     """Run the deterministic policy and search violating steps for a safe action in the simulator.
 
     At most `limit` of the violating steps, a seeded sample, are searched.
     """
-    envs = make_simulator(task, num_envs, settings)
+    envs = make_simulator(task, num_envs)
     observations, infos = envs.reset(seed=seed)
     gyro = envs.observation_layout["gyro"]
     found: list[tuple[dict[str, NDArray[Any]], float, float]] = []
@@ -332,7 +348,7 @@ def check_policy(
     chosen = np.random.default_rng(seed).permutation(len(found))[:limit]
     if not len(chosen):
         return PolicyCheck(total, 0, 0, 0)
-    simulator = make_simulator(task, settings=settings)
+    simulator = make_simulator(task)
     worlds = {name: np.stack([found[i][0][name] for i in chosen]) for name in found[0][0]}
     rates, phis = (np.array([found[i][column] for i in chosen]) for column in (1, 2))
     g = simulated_grid(simulator, worlds, rates, phis, zeta, eta)[1]

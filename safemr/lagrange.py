@@ -23,12 +23,14 @@ MultiplierOptimizer = Literal["adam", "sgd"]
 class MultiplierConfig:
     """The multiplier's part of a -Lagrangian baseline's hyperparameters."""
 
-    multiplier_initial: float = 1.0
-    multiplier_lr: float = 5e-2
-    multiplier_optimizer: MultiplierOptimizer = "adam"
+    multiplier_initial: float = 1.0  # lambda at the start
+    multiplier_lr: float = 5e-2  # learning rate of lambda's raw parameter, a step an epoch
+    multiplier_optimizer: MultiplierOptimizer = "adam"  # sgd: steps in proportion to the violation
 
-    POSITIVE: ClassVar[tuple[str, ...]] = ("multiplier_lr",)
-    NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ("multiplier_initial",)
+    RANGES: ClassVar[Mapping[str, str]] = {
+        "multiplier_initial": "[0, 1e6]",
+        "multiplier_lr": "(0, 1]",
+    }
     CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {"multiplier_optimizer": ("adam", "sgd")}
 
 

@@ -11,6 +11,7 @@ import fcntl
 import os
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from safemr.errors import UserError, tell
@@ -29,8 +30,11 @@ class ProcessLock:
         self.path, self._work = path, work
         self._descriptor: int | None = None
 
-    def acquire(self, *, wait: bool) -> None:
-        """Take the lock; when it is held, wait for its owner to end, or raise LockedError."""
+    def acquire(self, *, wait: bool, while_waiting: Callable[[], None] = lambda: None) -> None:
+        """Take the lock; when it is held, wait for its owner to end, or raise LockedError.
+
+        ``while_waiting`` is called twice a second and may raise to give up.
+        """
         announced = False
         while not self._try():
             owner = self._owner()
@@ -39,6 +43,7 @@ class ProcessLock:
             if not announced:
                 tell(f"waiting for {owner}, which {self._work}")
                 announced = True
+            while_waiting()
             time.sleep(0.5)
 
     def _owner(self) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -86,7 +87,9 @@ class Measurements:
                 if _digest(stored["value"]) != stored["sha256"]:
                     raise ValueError("its value does not have the checksum it states")
                 return stored["value"]
-            except (OSError, ValueError, KeyError, TypeError) as error:
+            except OSError as error:
+                raise _unreadable(path, error) from error
+            except (ValueError, KeyError, TypeError) as error:
                 raise _damaged(path, error) from error
         value = json.loads(json.dumps(measure()))  # what a reader of the file gets
         content = {**header, "sha256": _digest(value), "value": value}
@@ -109,6 +112,8 @@ class Measurements:
             try:  # the archive's own checksums guard it
                 return {k: v for k, v in data.load(path).items() if k != HEADER}
             except UserError as error:
+                if isinstance(error.__cause__, OSError):
+                    raise _unreadable(path, error.__cause__) from error
                 raise _damaged(path, error) from error
         made = measure()
         data.save(path, {**made, HEADER: np.array(json.dumps(header, sort_keys=True))})
@@ -124,15 +129,19 @@ class Measurements:
 
     @staticmethod
     def _supersede(path: Path) -> None:
-        label = path.stem[:-12]
-        for other in path.parent.glob(f"*{path.suffix}"):
-            if other.stem[:-12] == label and other != path:
+        ours = re.compile(re.escape(path.stem[:-12]) + r"[0-9a-f]{12}" + re.escape(path.suffix))
+        for other in path.parent.iterdir():
+            if ours.fullmatch(other.name) and other != path:
                 other.unlink(missing_ok=True)
 
 
 def _digest(value: Any) -> str:
     text = json.dumps(value, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _unreadable(path: Path, error: OSError) -> UserError:
+    return UserError(f"measurement {path} cannot be read: {error.strerror or error}")
 
 
 def _damaged(path: Path, error: Exception) -> UserError:

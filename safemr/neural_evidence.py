@@ -23,6 +23,7 @@ from safemr import aircraft, aircraft_evidence, reachability, reference
 from safemr.aircraft import Certificate, Truth
 from safemr.aircraft_evidence import TrueSets
 from safemr.algorithms.neural_safemr import neural_energy
+from safemr.conventions import COVERS
 from safemr.measurements import VERSIONS, Measurements, record_inputs
 from safemr.networks import StackedMLP
 from safemr.observation import ObservationTransform
@@ -31,12 +32,13 @@ from safemr.plotting.data import below
 from safemr.policies import Policy, network_from_arrays
 from safemr.reachability import Solution
 from safemr.reachability.grid import Floats
-from safemr.runs import describe_task
+from safemr.recorded_energy import NETWORK, learners
+from safemr.runs import installed
 from safemr.tables import Table, describe_missing
 
 CONTROL = "fit to the truth"
 CONTROL_SHARES = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
-ARRAYS = ("zeta", "length_scale", "smoothing", "certificate_parameters")  # in a policy file
+ARRAYS = ("zeta", "length_scale", "smoothing", NETWORK)  # in a policy file
 SLICE, SPACING = 180.0, 0.1  # [degree], [m] of the plane that is drawn
 LOG2_STATES = 17  # Sobol points of the comparison: volumes are right to 0.1 %
 _CHUNK = 2**16  # states evaluated at once, which bounds the memory
@@ -96,7 +98,7 @@ def recorded_certificates(
 ) -> dict[str, list[Certificate]]:
     """Variant -> its certificates by seed, of the rows of `records.read_records`'s index."""
     found: dict[str, list[Certificate]] = {}
-    for run, saved in aircraft_evidence.learners(root, runs.sort_values("seed"), ARRAYS):
+    for run, saved in learners(root, runs.sort_values("seed"), dynamics, ARRAYS):
         certificate = recorded_certificate(dynamics, saved.policy())
         found.setdefault(str(run.variant), []).append(certificate)
     return found
@@ -195,11 +197,10 @@ def compare(
         | measured(recorded_certificate(dynamics, policy), saved.eta)
         | aircraft_evidence.flights_of(policy, starts, truth)
         for run, saved, policy in (
-            (run, saved, saved.policy())
-            for run, saved in aircraft_evidence.learners(root, runs, ARRAYS)
+            (run, saved, saved.policy()) for run, saved in learners(root, runs, dynamics, ARRAYS)
         )
     ]
-    covering = shifted_to_miss(truth, control, aircraft.COVERS)
+    covering = shifted_to_miss(truth, control, COVERS)
     rows += [
         {"kind": "certificate", "variant": name, "seed": -1} | measured(phi, 0.0)
         for name, phi in ((CONTROL, control), (f"{CONTROL}, shifted", covering))
@@ -214,7 +215,7 @@ def compare(
             | {"volume_ratio": float(claimed.sum() / truth.unsafe.sum())}
         )
     table = pd.DataFrame(rows)
-    table["covers"] = table["missed_share"] <= aircraft.COVERS
+    table["covers"] = table["missed_share"] <= COVERS
     table["least_volume_ratio"] = np.interp(
         table["missed_share"], frontier["missed_share"], frontier["volume_ratio"]
     )
@@ -232,7 +233,7 @@ def measured(
     """`compare`, with a control of the hyperparameters ``energy``, and `slice_at` for one seed of
     each variant; both kept among ``measurements``."""
     inputs: dict[str, Any] = {
-        "task": describe_task("Aircraft", {}),
+        "task": installed(sets.task),
         "policies": [record_inputs(root / str(folder)) for folder in sorted(runs["folder"])],
         "energy": settings_of(energy), "log2_states": sets.log2_states,
         "flights": aircraft_evidence.FLIGHTS, "solver": reachability.VERSION,
@@ -266,7 +267,7 @@ def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame) -> Table:
         "the best [sigma, k, n] needs at the same share missed; obeyed: collisions of the policy "
         "that keeps the constraint with the least turn, or violates it least. "
         f"{CONTROL.capitalize()}: the same function by supervised learning on the solved value, "
-        f"as it is and shifted to miss {100 * aircraft.COVERS:g}%."
+        f"as it is and shifted to miss {100 * COVERS:g}%."
     )
     lines = aircraft_evidence.table_lines(shown).drop(columns="at own eta")
     obeyed = shown.assign(collision_share=shown["obeyed_collision_share"])

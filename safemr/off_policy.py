@@ -57,7 +57,7 @@ class Trainer:
         self._held = torch.zeros(config.num_envs, action_dim)
         self._episodes = EpisodeStatistics(config.num_envs)
         self._owed = 0.0  # gradient steps earned by experience, not yet done
-        observations, infos = self.envs.reset(seed=environment_seed(seed))
+        observations, infos = self.envs.reset(seed=environment_seed(seed, 4))
         self._observations: NDArray[np.float32] = self.transform(observations)
         self._features = self._energy_features(infos)
 
@@ -158,6 +158,7 @@ class Trainer:
         self._random_actions.set_state(torch.as_tensor(state["random_actions"]))
         self._held.copy_(torch.as_tensor(state["held"]))
         self._episodes.load_state_dict(state["episodes"])
+        # np.array keeps the order in memory, which decides how products with them round.
         self._observations = np.array(state["observations"], np.float32)
         self._features = np.array(state["features"], np.float32)
         self.envs.set_state(state["envs"])

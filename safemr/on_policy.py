@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from safemr.episodes import EpisodeStatistics
-from safemr.errors import UserError
 from safemr.gaussian import GaussianActor, entropy, kl_divergence, log_density
+from safemr.hyperparameters import Hyperparameters, Setting
 from safemr.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.observation import ObservationTransform
 from safemr.policies import Policy
 from safemr.rollout import Rollout, gae, minibatches
-from safemr.training import MakeEnvs, check_finite, generator
+from safemr.training import MakeEnvs, check_finite, environment_seed, generator
 
 # Settings of the published experiments (safety-starter-agents) that differ from the defaults here;
 # the algorithms add their own. Networks and epoch are those of the JointSIS authors' comparison.
@@ -37,59 +37,54 @@ PUBLISHED: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class OnPolicyConfig:
+class OnPolicyConfig(Hyperparameters):
     """What the on-policy algorithms share. Steps are environment steps."""
 
     cost_limit: float = 0.0  # of an episode's undiscounted cost
-    gamma: float = 0.99
-    cost_gamma: float = 0.99
-    gae_lambda: float = 0.97
-    cost_gae_lambda: float = 0.97
-    target_kl: float = 0.01  # PPO: stop beyond 1.2 of it; trust region: its radius
+    gamma: float = 0.99  # discount of the reward; below 1, as time limits are bootstrapped through
+    cost_gamma: float = 0.99  # discount of the cost
+    gae_lambda: float = 0.97  # lambda of the reward's generalised advantages (GAE)
+    cost_gae_lambda: float = 0.97  # lambda of the cost's
+    target_kl: float = 0.01  # PPO: stop beyond kl_stop times it; trust region: its radius
 
-    num_envs: int = 8
+    num_envs: int = 8  # environments stepped together
     epoch_steps: int = 8_000  # between two updates, over all environments
 
     hidden: int = 64  # units of each of the two hidden layers
-    activation: Activation = "tanh"
-    initial_log_std: float = -0.5
-    value_lr: float = 1e-3
+    activation: Activation = "tanh"  # of the hidden layers
+    initial_log_std: float = -0.5  # log of the policy's standard deviation at the start
+    value_lr: float = 1e-3  # learning rate of both critics
     value_passes: int = 8  # over the epoch's data, for both critics
-    value_batch: int = 500  # samples a critic step
+    value_batch: int = 500  # samples a critic step; at most the whole epoch
 
-    POSITIVE: ClassVar[tuple[str, ...]] = (
-        "target_kl",
-        "num_envs",
-        "epoch_steps",
-        "hidden",
-        "value_lr",
-        "value_passes",
-        "value_batch",
-    )
-    NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ("cost_limit",)
-    SHARES: ClassVar[tuple[str, ...]] = ("gamma", "cost_gamma", "gae_lambda", "cost_gae_lambda")
+    RANGES: ClassVar[Mapping[str, str]] = {
+        "cost_limit": "[0, inf)",
+        **dict.fromkeys(("gamma", "cost_gamma"), "[0, 1)"),
+        **dict.fromkeys(("gae_lambda", "cost_gae_lambda"), "[0, 1]"),
+        "target_kl": "(0, 1]",
+        "num_envs": "[1, 4096]",
+        "epoch_steps": "[1, 1e8]",
+        "hidden": "[1, 4096]",
+        "initial_log_std": "[-10, 2]",  # actions are clipped to [-1, 1]
+        "value_lr": "(0, 1]",  # Adam moves every parameter by about its rate a step
+        **dict.fromkeys(("value_passes", "value_batch"), "[1, inf)"),
+    }
     CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {"activation": ACTIVATIONS}
 
     def __post_init__(self) -> None:
-        for part in type(self).__mro__:
-            declared = vars(part)
-            for name in declared.get("POSITIVE", ()):
-                self._require(name, getattr(self, name) > 0, "must be positive")
-            for name in declared.get("NOT_NEGATIVE", ()):
-                self._require(name, getattr(self, name) >= 0, "must not be negative")
-            for name in declared.get("SHARES", ()):
-                self._require(name, 0 <= getattr(self, name) <= 1, "must lie in [0, 1]")
-            for name, choices in declared.get("CHOICES", {}).items():
-                self._require(name, getattr(self, name) in choices, f"use one of {choices}")
-        self._require(
+        super().__post_init__()
+        self.require(
             "epoch_steps",
             self.epoch_steps % self.num_envs == 0,
             f"must be a multiple of num_envs = {self.num_envs}",
         )
 
-    def _require(self, name: str, holds: bool, remedy: str) -> None:
-        if not holds:
-            raise UserError(f"{name} = {getattr(self, name)!r}: {remedy}")
+    def check_setting(self, setting: Setting) -> None:
+        self.require(
+            "epoch_steps",
+            self.epoch_steps <= setting.total_steps,
+            f"must not exceed the budget of {setting.total_steps} steps",
+        )
 
 
 @dataclass(frozen=True)
@@ -165,9 +160,7 @@ class OnPolicyTrainer(ABC):
             config.epoch_steps // config.num_envs, config.num_envs, inputs, actions
         )
         self.statistics = EpisodeStatistics(config.num_envs)
-        # sub-environment i is seeded with this + i: streams of neighbouring run seeds must not meet
-        (env_seed,) = np.random.SeedSequence([seed, 3]).generate_state(1)
-        self.observations, _ = self.envs.reset(seed=int(env_seed >> 1))
+        self.observations, _ = self.envs.reset(seed=environment_seed(seed, 3))
 
     @property
     def policy(self) -> Policy:
@@ -305,7 +298,7 @@ class OnPolicyTrainer(ABC):
             "critic_optimizer": copy.deepcopy(self.critic_optimizer.state_dict()),
             "noise": self.noise.get_state(),
             "order": self.order.get_state(),
-            "observations": torch.from_numpy(np.array(self.observations)),
+            "observations": self.observations,
             "statistics": self.statistics.state_dict(),
             "envs": self.envs.get_state(),
         }
@@ -317,6 +310,6 @@ class OnPolicyTrainer(ABC):
         self.critic_optimizer.load_state_dict(state["critic_optimizer"])
         self.noise.set_state(state["noise"])
         self.order.set_state(state["order"])
-        self.observations = state["observations"].numpy().copy()
+        self.observations = np.array(state["observations"])  # in the same order in memory
         self.statistics.load_state_dict(state["statistics"])
         self.envs.set_state(state["envs"])

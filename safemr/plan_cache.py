@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from safemr import atomic, runs
+from safemr import tasks as tasks_of
 from safemr.config import Config
 
 _SOURCES = Path(__file__).resolve().parents[1]
@@ -53,5 +54,9 @@ def _key(config: Config) -> str:
 
 def _from_json(saved: dict[str, Any]) -> runs.Plan:
     points = {label: (a, b) for label, (a, b) in saved.pop("points").items()}
+    tasks = {
+        name: tasks_of.Described(task["entry"], tasks_of.Traits(**task["traits"]))
+        for name, task in saved.pop("tasks").items()
+    }
     groups = {name: tuple(runs.Run(**entry) for entry in group) for name, group in saved.items()}
-    return runs.Plan(**groups, points=points)
+    return runs.Plan(**groups, points=points, tasks=tasks)

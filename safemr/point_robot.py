@@ -101,3 +101,6 @@ class PointRobot:
             rate += h * spin
             x, y, heading = x + h * vx, y + h * vy, heading + h * rate
         return np.stack([x, y, heading], -1), np.stack([vx, vy, rate], -1)
+
+
+ROBOT = PointRobot()

@@ -7,8 +7,9 @@ parameters (keys ``multiplier_*`` and ``zeta``).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from safemr.errors import UserError
 from safemr.networks import ACTIVATIONS, StackedMLP
 from safemr.observation import ObservationTransform
+from safemr.records import POLICY, policy_arrays
 
 Arrays = dict[str, NDArray]
 
@@ -68,7 +70,14 @@ class Policy:
         deterministic: bool = True,
         generator: torch.Generator | None = None,
     ) -> NDArray[np.float32]:
-        """Actions float32 [N, A] for raw environment observations [N, obs]."""
+        """Actions float32 [N, A] for raw environment observations [N, obs], or [A] for one [obs].
+
+        Raises UserError where the observations are not of the environment that this policy reads.
+        """
+        observations = np.asarray(observations)
+        self.transform.check_width(observations)
+        if observations.ndim == 1:
+            return self.act(observations[None], deterministic, generator)[0]
         parameters = self.network.parameters
         inputs = torch.from_numpy(self.transform(observations)).to(parameters.device)
         output = self.network(inputs)[0]
@@ -113,21 +122,15 @@ class Policy:
         )
 
 
-def load_policy(path: str | os.PathLike[str]) -> Policy:
+def load_policy(path: str | PathLike[str]) -> Policy:
     """Reads ``policy.npz`` (or the record folder that holds it).
 
     Raises UserError when the file is missing, damaged or not a policy.
     """
-    path = os.fspath(path)
-    if os.path.isdir(path):
-        path = os.path.join(path, "policy.npz")
+    path = Path(path)
+    if path.is_dir():
+        path /= POLICY
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return Policy.from_arrays({key: archive[key] for key in archive.files})
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such policy; train the run first") from error
-    except (ValueError, KeyError, OSError, EOFError) as error:
+        return Policy.from_arrays(policy_arrays(path))
+    except (ValueError, KeyError) as error:
         raise UserError(f"{path}: not a policy file ({error}); retrain the run") from error
-    except Exception as error:
-        # zipfile.BadZipFile derives from Exception alone.
-        raise UserError(f"{path}: damaged archive ({error}); retrain the run") from error

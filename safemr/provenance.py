@@ -26,7 +26,10 @@ def source_revision() -> dict[str, Any]:
     def git(*arguments: str) -> str | None:
         try:
             command = ["git", "-C", str(tree), *arguments]
-            return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+            # In a session of its own: Ctrl-C must not take the commit out of a record.
+            return subprocess.run(
+                command, capture_output=True, text=True, check=True, start_new_session=True
+            ).stdout
         except (OSError, subprocess.CalledProcessError):
             return None
 

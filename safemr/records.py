@@ -18,7 +18,9 @@ import hashlib
 import io
 import json
 import math
+import os
 import re
+import shlex
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,6 +46,12 @@ REQUIRED_FILES = (CONFIG, PROGRESS, PROVENANCE)
 REQUIRED_METRICS = ("eval_return", "eval_cost", "eval_zero_violation_share")
 CONFIG_KEYS = {"schema", "task", "algorithm", "seed", "steps", "evaluation", "log_every"}
 PROVENANCE_KEYS = {"schema", "digest", "variant", "status", "files"}
+MEASURED = ("wall_s", "cpu_s", "peak_rss_mb")  # optional numbers of provenance.json
+
+# Where a record stands, <results root>/runs/<task>/<variant>/seed<n>-<digest>, and whose files it
+# may hold. Nothing else is ever advised to be removed.
+_PLACE = re.compile(r"(^|.*/)runs/[^/]+/[^/]+/seed\d+-[0-9a-f]{12}")
+_OWN = re.compile(r"config\.json|progress\.csv|policy\.npz|provenance\.json|\..+\.tmp")
 
 Row = Mapping[str, float]
 
@@ -154,11 +162,16 @@ def write_record(
     atomic.write(folder / PROVENANCE, text.encode())
 
 
-def load_policy(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused."""
+def policy_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused.
+
+    Raises UserError where there is no such file, or none that can be read.
+    """
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such policy; train the run first") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is not a readable policy file: {error}") from error
 
@@ -184,8 +197,10 @@ def is_complete(folder: Path) -> bool:
 def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, float]]]:
     """The config, provenance and progress rows of a record that passed every check."""
 
+    _require_place(folder)
+
     def refuse(fault: str) -> RecordError:
-        return RecordError(f"record {folder}: {fault}; repair: rm -r '{folder}' && snakemake -j2")
+        return RecordError(f"record {folder}: {fault}; repair: {_repair(folder)}")
 
     missing = [name for name in REQUIRED_FILES if not (folder / name).is_file()]
     if missing:
@@ -210,14 +225,21 @@ def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[s
     for name in (CONFIG, PROGRESS, *([POLICY] if POLICY in contents else [])):
         if hashlib.sha256(contents[name]).hexdigest() != provenance["files"].get(name):
             raise refuse(f"{name} does not have the checksum in provenance.json")
+    for name in MEASURED:
+        value = provenance.get(name)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        if value is not None and not (number and 0 <= value < math.inf):
+            raise refuse(f"{name} in its provenance is not a number of at least 0")
+    if not isinstance(provenance.get("cpu"), (str, type(None))):
+        raise refuse("cpu in its provenance is not text")
     try:
         place = record_path(config, provenance["variant"]).parts
     except (KeyError, TypeError, ValueError) as error:
         raise refuse(f"config.json is malformed ({error!r})") from None
     if config_digest(config) != provenance["digest"]:
         raise refuse("config.json does not have the digest in provenance.json")
-    if folder.absolute().parts[-len(place) :] != place:
-        raise refuse(f"it belongs to {Path(*place)}")
+    if _full(folder).parts[-len(place) :] != place:
+        raise refuse(f"it belongs to {Path(*place)}: move it there, or")
     try:
         rows = parse_progress(contents[PROGRESS].decode())
     except ValueError as error:
@@ -231,6 +253,41 @@ def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[s
     return config, provenance, rows
 
 
+def _full(folder: Path) -> Path:
+    """An absolute path without ``..``, symbolic links kept: what a person would call the place."""
+    return Path(os.path.abspath(folder))
+
+
+def _require_place(folder: Path) -> None:
+    """Raises RecordError where ``folder`` is not a record's place and hence none of ours."""
+    if _PLACE.fullmatch(_full(folder).as_posix()) and (folder.is_dir() or not folder.exists()):
+        return
+    what = "a record is a folder <results root>/runs/<task>/<variant>/seed<n>-<digest>"
+    if not folder.is_dir():
+        kind = "a file" if folder.exists() else "no folder"
+        raise RecordError(f"record {folder}: it is {kind}; {what}")
+    entries = sorted(path.name for path in folder.iterdir())
+    found = f"it holds {_some(entries)}" if entries else "it is empty"
+    raise RecordError(f"record {folder}: {found}; {what} with {', '.join(REQUIRED_FILES)}")
+
+
+def _repair(folder: Path) -> str:
+    """The command that makes a record anew; removing what is not a record's is never advised."""
+    if not folder.exists():
+        return "snakemake -j2, which trains it where the configuration asks for it"
+    foreign = sorted(path.name for path in folder.iterdir() if not _OWN.fullmatch(path.name))
+    if foreign:
+        return f"it also holds {_some(foreign)}, which is no part of a record; move that away first"
+    quoted = shlex.quote(str(folder))
+    return f"rm -r {quoted} && snakemake -j2"
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first of some names, and how many more there are."""
+    more = len(names) - 5
+    return ", ".join(names[:5]) + (f" and {more} more" if more > 0 else "")
+
+
 def read_records(
     root: Path, folders: Iterable[Path | str] | None = None
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -242,8 +299,8 @@ def read_records(
 
     Returns:
         The index (task, variant, seed, digest, folder, algorithm, steps, and what provenance says
-        of time and machine), one row a run; and the tidy progress table (task, variant, seed,
-        step, metric, value) without NaN values.
+        of time and machine, nan or None where it says nothing), one row a run; and the tidy
+        progress table (task, variant, seed, step, metric, value) without NaN values.
 
     Raises:
         RecordError: on the first record that must not be believed.
@@ -269,9 +326,7 @@ def read_records(
                 "digest": provenance["digest"],
                 "algorithm": config["algorithm"]["name"],
                 "steps": config["steps"],
-                **{
-                    name: provenance.get(name) for name in ("wall_s", "cpu_s", "peak_rss_mb", "cpu")
-                },
+                **{name: provenance.get(name) for name in (*MEASURED, "cpu")},
                 "folder": folder.as_posix(),
             }
         )
@@ -280,4 +335,6 @@ def read_records(
         tables.append(tidy.assign(**key))
     columns = ["task", "variant", "seed", "step", "metric", "value"]
     progress = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=columns)
-    return pd.DataFrame(index), progress[columns]
+    runs = pd.DataFrame(index)
+    # A column that no record fills would hold None, with which nothing can be computed.
+    return runs.astype({name: float for name in MEASURED if name in runs}), progress[columns]

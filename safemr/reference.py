@@ -15,6 +15,7 @@ METHOD = "SafeMR"
 CMDP_BASELINES = ("PPO-L", "TRPO-L", "CPO")
 BASELINES = ("JointSIS", *CMDP_BASELINES, "FAC-phi0", "FAC-phih")
 ALGORITHMS = (METHOD, *BASELINES)
+LEARNERS = (METHOD, "JointSIS")  # their zeta is learned
 
 
 class Zeta(NamedTuple):

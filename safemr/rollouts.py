@@ -7,7 +7,6 @@ positions. `safemr.plotting.data` writes and reads them; the figures of `safemr.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +19,8 @@ from safemr.falsification import make_simulator
 from safemr.measurements import Measurements, record_inputs, record_label
 from safemr.plotting.data import GEOMETRY, Arrays
 from safemr.reference import Zeta
-from safemr.runs import describe_task
+from safemr.runs import installed
+from safemr.tasks import Task, name_of
 
 if TYPE_CHECKING:
     from safemr.certify import Certificate
@@ -31,24 +31,26 @@ TOUCHED = 1e-5  # m off the free path: a contact
 
 def episodes(
     policy: Acts,
-    task: str,
+    task: Task,
     *,
     seeds: list[int],
     steps: int = 1000,
-    settings: Mapping[str, Any] | None = None,
 ) -> Arrays:
     """The first `steps` steps of the deterministic policy, one episode a seed.
 
     Returns robot [T+1, N, 3] (x, y, heading), goal [T+1, N, 2], box [T+1, N, 3] (nan without a
-    box), obstacles [N, M, 2], reward [T, N], cost_indicator [T, N], goal_met [T, N], and the task's
-    geometry. The same seeds give the same layouts to every policy. Raises UserError for more steps
-    than an episode has.
+    box), vase [T+1, N, 3] in a task that has one, obstacles [N, M, 2], reward [T, N],
+    cost_indicator [T, N], goal_met [T, N], and the task's geometry. The same seeds give the same
+    layouts to every policy. Raises UserError for more steps than an episode has.
     """
-    envs = make_simulator(task, len(seeds), settings)
+    envs = make_simulator(task, len(seeds))
     if steps > envs.max_episode_steps:
-        raise UserError(f"{task} episodes have {envs.max_episode_steps} steps, {steps} were asked")
+        raise UserError(
+            f"{name_of(task)} episodes have {envs.max_episode_steps} steps, {steps} were asked"
+        )
     observations, _ = envs.reset(seed=seeds)
-    tracks: dict[str, list[NDArray[Any]]] = {name: [] for name in ("robot", "goal", "box")}
+    bodies = ("robot", "goal", "box", *(("vase",) if envs.task.has_vase else ()))
+    tracks: dict[str, list[NDArray[Any]]] = {name: [] for name in bodies}
     scores: dict[str, list[NDArray[Any]]] = {
         name: [] for name in ("reward", "cost_indicator", "goal_met")
     }
@@ -92,13 +94,12 @@ def multipliers(policy: Policy, observations: NDArray[Any]) -> NDArray[np.float6
 def multiplier_map(
     policy: Policy,
     zeta: Zeta,
-    task: str,
+    task: Task,
     *,
     seed: int = 0,
     speed: float = 0.75,
     heading: float = 0.0,
     points: int = 81,
-    settings: Mapping[str, Any] | None = None,
 ) -> Arrays:
     """lambda(s) and phi(s) for a robot moving along `heading` at `speed`, over the task's square.
 
@@ -107,7 +108,7 @@ def multiplier_map(
     [P, P] (rows along y), obstacles, goal, speed, heading, geometry. The multiplier is nan inside
     d_min and where the robot touches something, which changes its velocity.
     """
-    envs = make_simulator(task, points, settings)
+    envs = make_simulator(task, points)
     envs.reset(seed=[seed] * points)
     scene, template = envs.scene(0), envs.get_state()
     extent = float(envs.task.extent)
@@ -141,11 +142,10 @@ def multiplier_map(
 def measured(
     measurements: Measurements,
     certificate: Certificate,
-    task: str,
+    task: Task,
     *,
     layouts: list[int],
     steps: int,
-    settings: Mapping[str, Any],
 ) -> Arrays:
     """`episodes` and `multiplier_map` (of the first layout) of a certificate's recorded policy.
 
@@ -154,7 +154,7 @@ def measured(
     assert certificate.policy is not None
     inputs = {
         "policy": record_inputs(certificate.policy), "zeta": list(certificate.zeta),
-        "task": describe_task(task, settings),
+        "task": installed(task),
         "layouts": layouts, "steps": steps,
     }  # fmt: skip
 
@@ -164,10 +164,8 @@ def measured(
         assert certificate.policy is not None
         policy = load_policy(certificate.policy)
         parts = {
-            "episodes": episodes(policy, task, seeds=layouts, steps=steps, settings=settings),
-            "map": multiplier_map(
-                policy, certificate.zeta, task, seed=layouts[0], settings=settings
-            ),
+            "episodes": episodes(policy, task, seeds=layouts, steps=steps),
+            "map": multiplier_map(policy, certificate.zeta, task, seed=layouts[0]),
         }
         return {f"{part}/{name}": x for part, made in parts.items() for name, x in made.items()}
 

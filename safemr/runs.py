@@ -7,24 +7,33 @@ numbers changes the digest, and with it the folder of the record.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib
-import inspect
 import json
-import math
-import pkgutil
-import types
-import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr import records
-from safemr.config import FAMILIES, Config, Variant, unknown
+from safemr import records, reference
+from safemr.catalogue import Algorithm, hyperparameters, load_algorithm
+from safemr.catalogue import algorithm_names as algorithm_names
+from safemr.config import Config, Variant
 from safemr.errors import UserError
+from safemr.hyperparameters import Setting
+from safemr.names import unknown
 from safemr.strict_yaml import show
+from safemr.tasks import (
+    Described,
+    Traits,
+    base_of,
+    make_envs,
+    name_of,
+    settings_of,
+    task_settings,
+    traits,
+)
+from safemr.tasks import Task as TaskOrName
 
 _ENVIRONMENTS = "envs"  # the package that registers the tasks with Gymnasium
 
@@ -58,7 +67,7 @@ class Plan:
     """All runs of a configuration.
 
     ``points`` maps the variant label of each sensitivity point to (a, b). A point that equals its
-    base variant is that variant: nothing is trained twice.
+    base variant is that variant: nothing is trained twice. ``tasks`` are those of its runs.
     """
 
     navigation: tuple[Run, ...]
@@ -66,6 +75,7 @@ class Plan:
     aircraft: tuple[Run, ...]
     outside: tuple[Run, ...]
     points: Mapping[str, tuple[float, float]]
+    tasks: Mapping[str, Described]
 
     @property
     def trained(self) -> tuple[Run, ...]:
@@ -77,43 +87,6 @@ class Plan:
     def runs(self) -> tuple[Run, ...]:
         """Every run, the outside ones last."""
         return (*self.trained, *self.outside)
-
-
-@dataclass(frozen=True)
-class Algorithm:
-    """What a module of `safemr.algorithms` says about itself."""
-
-    name: str
-    version: int
-    family: str
-    hyperparameters: type[Any]  # the frozen dataclass ``Config``
-    trainer: type[Any]
-
-
-def algorithm_names() -> list[str]:
-    """The modules in `safemr.algorithms`: one file is one algorithm."""
-    package = importlib.import_module("safemr.algorithms")
-    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
-
-
-@functools.cache
-def load_algorithm(name: str, where: str = "") -> Algorithm:
-    """Import an algorithm by name and check the module's contract."""
-    if name not in algorithm_names():
-        raise unknown("algorithm", name, algorithm_names(), where)
-    file = f"safemr/algorithms/{name}.py"
-    try:
-        module = importlib.import_module(f"safemr.algorithms.{name}")
-    except Exception as error:  # whatever is wrong in that file, its author wants to know where
-        reason = str(error).partition("\n")[0]
-        raise UserError(f"{file} does not import: {type(error).__name__}: {reason}") from error
-    for part in ("VERSION", "Config", "Trainer"):
-        if not hasattr(module, part):
-            raise UserError(f"{file} must define {part}")
-    family = getattr(module.Trainer, "family", None)
-    if family not in FAMILIES:
-        raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
-    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer)
 
 
 @functools.cache
@@ -134,87 +107,92 @@ def task_names() -> list[str]:
 def _task_version(name: str, settings_json: str) -> int:
     gymnasium = importlib.import_module("gymnasium")
     settings = json.loads(settings_json)
-    try:
-        environment = gymnasium.make(f"{name}-v0", disable_env_checker=True, **settings)
+    known = gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped.setting_names
+    for setting in settings:  # before Gymnasium sees them: it has keywords of its own, as `task`
+        if setting not in known:
+            raise unknown("setting", setting, known, f"task {name}")
+    try:  # a batch, since that is what learners train on
+        environment = gymnasium.make_vec(
+            f"{name}-v0", vectorization_mode="vector_entry_point", **settings
+        )
     except Exception as error:  # the environment's own validation, whatever its type
-        known = _setting_names(name)
-        for setting in settings:
-            if known and setting not in known:
-                raise unknown("setting", setting, known, f"task {name}") from error
-        reason = str(error).partition(" was raised from the environment creator")[0]
-        raise UserError(f"task {name}: {reason.partition(chr(10))[0]}") from error
+        reason = str(error).partition(chr(10))[0].removeprefix(f"{name}: ")
+        raise UserError(f"task {name}: {reason}") from error
     version = int(environment.unwrapped.task_version)
     environment.close()
     return version
 
 
-def _setting_names(name: str) -> list[str]:
-    gymnasium = importlib.import_module("gymnasium")
-    constructor = type(gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped).__init__
-    parameters = list(inspect.signature(constructor).parameters.values())[1:]
-    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
-        return []
-    return [p.name for p in parameters]
+def describe_task(
+    name: str, settings: Mapping[str, Any], where: str = "", *, base: str | None = None
+) -> dict[str, Any]:
+    """The ``task`` entry of a run's config: name, version and settings.
 
-
-def describe_task(name: str, settings: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """The ``task`` entry of a run's config: name, version and settings."""
-    if name not in task_names():
-        raise unknown("task", name, task_names(), where)
+    base: the registered task of which ``name`` is a variant; then the entry says it, too.
+    """
+    registered = name if base is None else base
+    if registered not in task_names():
+        raise unknown("task", registered, task_names(), where)
+    if base is not None and name.lower() in (known.lower() for known in task_names()):
+        raise UserError(f"{name!r} is the name of a registered task; give {where} another one")
     try:
         text = records.canonical_json(settings)
     except (TypeError, ValueError) as error:
         raise UserError(f"settings of task {name}: {error}") from error
-    return {"name": name, "version": _task_version(name, text), "settings": dict(settings)}
+    entry = {"name": name, "version": _task_version(registered, text), "settings": dict(settings)}
+    return entry if base is None else {**entry, "base": base}
 
 
-def hyperparameters(
-    algorithm: Algorithm, overrides: Mapping[str, Any], where: str
-) -> dict[str, Any]:
-    """The complete hyperparameters of an algorithm, defaults included, types and ranges checked."""
-    hints = typing.get_type_hints(algorithm.hyperparameters)
-    names = {field.name for field in dataclasses.fields(algorithm.hyperparameters) if field.init}
-    values = {}
-    for name, value in overrides.items():
-        if name not in names:
-            raise unknown("hyperparameter", name, names, f"{where} ({algorithm.name})")
-        values[name] = coerce(value, hints[name], f"{where}: {name}")
+def installed(task: TaskOrName) -> dict[str, Any]:
+    """The entry of a task as the installed environments have it: what a new run would say."""
+    base = None if name_of(task) == base_of(task) else base_of(task)
+    return describe_task(name_of(task), settings_of(task), base=base)
+
+
+def described(entry: Mapping[str, Any]) -> Described:
+    """A task's entry with the traits of its environment."""
+    return Described(entry, _traits(records.canonical_json(entry)))
+
+
+@functools.cache
+def _traits(entry_json: str) -> Traits:
+    envs = make_envs(json.loads(entry_json), 1)  # the batched one, which is what runs are made of
+    found = traits(envs)
+    envs.close()
+    return found
+
+
+def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
+    """A registered task under its own name has its own settings, the simulation's apart.
+
+    Raises:
+        UserError: naming ``where`` and the setting that makes another task of it.
+    """
+    changed = task_settings(entry["settings"])
+    if "base" not in entry and changed:
+        name, value = next(iter(changed.items()))
+        raise UserError(
+            f"{where}: {name} = {show(value)} makes another task of {entry['name']}, which needs a "
+            f"name of its own: {remedy}"
+        )
+
+
+def check_setting(
+    algorithm: Algorithm, values: Mapping[str, Any], task: Mapping[str, Any], steps: int, where: str
+) -> None:
+    """Refuse hyperparameters that cannot work on a task, as `describe_task` gives it, in a budget.
+
+    Raises:
+        UserError: it names the hyperparameter, and what it may be there.
+    """
+    check = getattr(algorithm.hyperparameters(**values), "check_setting", None)
+    if check is None:  # an algorithm that does without `safemr.hyperparameters`
+        return
     try:
-        complete = algorithm.hyperparameters(**values)
-    except (UserError, ValueError) as error:
-        raise UserError(f"{where}: {error}") from error
-    return dataclasses.asdict(complete)
-
-
-def coerce(value: Any, hint: Any, where: str) -> Any:
-    """``value`` as the annotated type, or a UserError. Integers pass as floats, nothing else."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if hint is Any:
-        return value
-    if origin is typing.Literal:
-        if not any(value == choice and type(value) is type(choice) for choice in arguments):
-            raise unknown("value", value, map(str, arguments), where)
-        return value
-    if origin in (typing.Union, types.UnionType):
-        for option in arguments:
-            try:
-                return coerce(value, option, where)
-            except UserError:
-                continue
-    elif origin in (tuple, list) and isinstance(value, (list, tuple)):
-        variadic = origin is list or arguments[-1:] == (Ellipsis,)
-        types_of = [arguments[0]] * len(value) if variadic else list(arguments)
-        if len(types_of) == len(value):
-            return origin(coerce(v, t, where) for v, t in zip(value, types_of, strict=True))
-    elif hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        if abs(value) < math.inf and abs(value) < 1e300:
-            return float(value)
-    elif (hint is None or hint is type(None)) and value is None:
-        return None
-    elif hint in (int, str, bool) and type(value) is hint:
-        return value
-    name = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
-    raise UserError(f"{where} must be {name}, not {show(value)}")
+        has = described(task).traits
+        check(Setting(has.action_dim, has.episode_steps or steps, steps))
+    except UserError as error:
+        raise UserError(f"{where} on {task['name']}: {error}") from error
 
 
 def make_run(
@@ -277,6 +255,11 @@ def resolve(config: Config) -> Plan:
     aircraft: list[Run] = []
     if config.aircraft:
         part_of = config.aircraft
+        if part_of.task != reference.AIRCRAFT_TASK:
+            raise UserError(
+                f"aircraft.task = {part_of.task!r}: the experiment's truth is solved for "
+                f"{reference.AIRCRAFT_TASK} only; put other tasks into tasks"
+            )
         aircraft = list(
             resolver.grid(
                 part_of.task,
@@ -286,8 +269,17 @@ def resolve(config: Config) -> Plan:
                 "aircraft.task",
             )
         )
+    outside = tuple(resolver.outside())
+    entries = {
+        run.task: run.config["task"] for run in (*navigation, *sensitivity, *aircraft, *outside)
+    }
     plan = Plan(
-        tuple(navigation), tuple(sensitivity), tuple(aircraft), tuple(resolver.outside()), points
+        tuple(navigation),
+        tuple(sensitivity),
+        tuple(aircraft),
+        outside,
+        points,
+        {name: described(entry) for name, entry in entries.items()},
     )
     _check_distinct(plan)
     return plan
@@ -311,14 +303,16 @@ class _Resolver:
                 hyperparameters(
                     load_algorithm(variant.algorithm), variant.overrides, f"{section}.{label}"
                 )
+        for task in config.task_variants:
+            self._task(task, f"tasks.{task}")
         for task, overrides in config.task_overrides.items():
-            describe_task(task, overrides.settings, "task_overrides")
+            self._task(task, "task_overrides")
             for family, values in overrides.hyperparameters.items():
                 names = {
-                    field.name
+                    name
                     for algorithm in algorithms
                     if algorithm.family == family
-                    for field in dataclasses.fields(algorithm.hyperparameters)
+                    for name in algorithm.settable
                 }
                 for name in values.keys() - names:
                     where = f"task_overrides.{task}.hyperparameters.{family}"
@@ -337,11 +331,12 @@ class _Resolver:
         for label, variant in variants.items():
             algorithm = load_algorithm(variant.algorithm)
             shared = overrides.hyperparameters.get(algorithm.family, {}) if overrides else {}
-            names = {field.name for field in dataclasses.fields(algorithm.hyperparameters)}
+            names = algorithm.settable
             # What makes the variant what it is stands above what tunes a family to a task.
             chosen = {k: v for k, v in shared.items() if k in names} | dict(variant.overrides)
             values = hyperparameters(algorithm, chosen, f"{section}.{label}")
             steps = self._steps(task, algorithm.family)
+            check_setting(algorithm, values, described, steps, f"{section}.{label}")
             for seed in seeds:
                 yield make_run(
                     described,
@@ -383,8 +378,30 @@ class _Resolver:
                     yield _run(described, algorithm, label, seed, entry.steps, **schedule)
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
-        overrides = self.config.task_overrides.get(name)
-        return describe_task(name, overrides.settings if overrides else {}, section)
+        """The entry of a task by its name in the configuration."""
+        overrides, variant = (
+            self.config.task_overrides.get(name),
+            self.config.task_variants.get(name),
+        )
+        given = dict(overrides.settings) if overrides else {}
+        if variant is None:
+            if name not in task_names():
+                raise unknown("task", name, [*task_names(), *self.config.task_variants], section)
+            entry = describe_task(name, given, section)
+            shown = ", ".join(f"{key}: {value}" for key, value in task_settings(given).items())
+            remedy = f"tasks: {{NAME: {{base: {name}, settings: {{{shown[:80]}}}}}}}"
+            check_name(entry, f"task_overrides.{name}.settings", remedy)
+            return entry
+        where = f"tasks.{name}"
+        if not variant.settings:
+            raise UserError(f"{where}.settings is empty: then it is {variant.base} itself")
+        describe_task(variant.base, variant.settings, where)
+        if task_settings(given):
+            raise UserError(
+                f"task_overrides.{name}.settings: {next(iter(task_settings(given)))} belongs into "
+                f"{where}.settings"
+            )
+        return describe_task(name, {**variant.settings, **given}, where, base=variant.base)
 
     def _steps(self, task: str, family: str) -> int:
         overrides = self.config.task_overrides.get(task)
@@ -414,3 +431,8 @@ def _check_distinct(plan: Plan) -> None:
                 f"{labels[key]!r} and {run.variant!r} are the same algorithm with the same "
                 f"hyperparameters on {run.task}; remove one"
             )
+    names: dict[str, str] = {}
+    for name, task in plan.tasks.items():
+        same = records.canonical_json([base_of(task.entry), settings_of(task.entry)])
+        if names.setdefault(same, name) != name:
+            raise UserError(f"{names[same]!r} and {name!r} are the same task; remove one")

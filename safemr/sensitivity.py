@@ -18,8 +18,9 @@ def table_two(
     missing: pd.DataFrame | None = None,
     task: str = reference.SENSITIVITY_TASK,
 ) -> Table:
-    """Table II: learned [sigma, k, n] for each [a, b], per seed and mean, beside the paper's.
+    """Table II: learned [sigma, k, n] for each [a, b], per seed and mean.
 
+    Beside the paper's, on the task that it names.
     final: score table with the last values of sigma, k, n (`statistics.last_values`).
     points: variant -> (a, b).
     """
@@ -30,8 +31,9 @@ def table_two(
             rows.append([a, b, variant, str(seed), *(zeta[name][seed] for name in zeta)])
         means = [statistics.mean_interval(values.to_numpy(float)) for values in zeta.values()]
         rows.append([a, b, variant, "mean", *(m.mean for m in means)])
-        rows.append([a, b, variant, "half width", *(m.half_width for m in means)])
-        if (a, b) in reference.TABLE_II:
+        if not any(np.isnan(m.half_width) for m in means):
+            rows.append([a, b, variant, "half width", *(m.half_width for m in means)])
+        if task == reference.SENSITIVITY_TASK and (a, b) in reference.TABLE_II:
             rows.append([a, b, variant, "paper", *reference.TABLE_II[(a, b)]])
     data = pd.DataFrame(rows, columns=["a", "b", "variant", "seed", "sigma", "k", "n"])
     display = pd.DataFrame(
@@ -41,9 +43,11 @@ def table_two(
             **{name: [number(value, 3) for value in data[name]] for name in ("sigma", "k", "n")},
         }
     )
+    papers = task == reference.SENSITIVITY_TASK
+    beside = ", and the paper's" if papers else ""
     caption = (
-        f"Table II. Learned energy-function parameters on {task} for each [a, b]: last value of "
-        "each run, mean and half width of the 95% t interval over seeds, and the paper's."
+        f"{'Table II. ' * papers}Learned energy-function parameters on {task} for each [a, b]: "
+        f"last value of each run, mean and half width of the 95% t interval over seeds{beside}."
     )
     return Table("table2", caption, data, display, missing_notes(missing, [task], list(points)))
 

@@ -23,7 +23,12 @@ LEVEL = 0.95  # confidence level of every interval in the paper and here
 REPLICATES = (
     2000  # bootstrap resamples; the Monte-Carlo error of a limit is then well below 0.1 s.d.
 )
+FEWEST_RUNS = 3  # for an interval: that of two runs is 13 of their standard errors wide, or nothing
 FINAL_SHARE = 0.1  # final performance: the last 10% of a run's evaluations
+
+UNBOUNDED = (-np.inf, np.inf)
+_SHARES = ("zero_violation_share", "violation_rate")
+_COUNTS = ("violations", "goals", "episodes", "minutes", "length")
 
 Samples = Mapping[str, np.ndarray]  # task -> [seeds] one score a run
 
@@ -42,10 +47,22 @@ class Estimate(NamedTuple):
         return (self.high - self.low) / 2
 
 
-def mean_interval(values: np.ndarray, level: float = LEVEL) -> Estimate:
+def bounds_of(metric: str) -> tuple[float, float]:
+    """Between which values the mean of a metric lies whatever the runs: shares, costs, counts."""
+    name = metric.removeprefix("eval_").removeprefix("train_")
+    if name in _SHARES:
+        return (0.0, 1.0)
+    return (0.0, np.inf) if name in _COUNTS or name.startswith("cost") else UNBOUNDED
+
+
+def mean_interval(
+    values: np.ndarray, level: float = LEVEL, bounds: tuple[float, float] = UNBOUNDED
+) -> Estimate:
     """Mean of independent runs and its Student-t interval, mean +- t(n-1) s / sqrt(n).
 
-    `values` [n] is one number a seed; nan entries are dropped. One run has a mean but no interval.
+    `values` [n] is one number a seed; nan entries are dropped. Fewer than `FEWEST_RUNS` have a mean
+    but no interval. What of it lies outside `bounds` (`bounds_of`), where the quantity cannot be,
+    is cut off.
     """
     sample = np.asarray(values, dtype=float)
     sample = sample[~np.isnan(sample)]
@@ -53,10 +70,12 @@ def mean_interval(values: np.ndarray, level: float = LEVEL) -> Estimate:
     if count == 0:
         return Estimate(np.nan, np.nan, np.nan, 0)
     mean = float(sample.mean())
-    if count == 1:
-        return Estimate(mean, np.nan, np.nan, 1)
+    if count < FEWEST_RUNS:
+        return Estimate(mean, np.nan, np.nan, count)
+    if sample.min() == sample.max():  # whose deviation is rounding
+        return Estimate(float(sample[0]), float(sample[0]), float(sample[0]), count)
     half = float(stdtrit(count - 1, (1 + level) / 2) * sample.std(ddof=1) / np.sqrt(count))
-    return Estimate(mean, mean - half, mean + half, count)
+    return Estimate(mean, max(mean - half, bounds[0]), min(mean + half, bounds[1]), count)
 
 
 def difference_interval(first: np.ndarray, second: np.ndarray, level: float = LEVEL) -> Estimate:
@@ -69,7 +88,7 @@ def difference_interval(first: np.ndarray, second: np.ndarray, level: float = LE
     if not len(x) or not len(y):
         return Estimate(np.nan, np.nan, np.nan, 0)
     gap, count = float(x.mean() - y.mean()), min(len(x), len(y))
-    if count < 2:
+    if count < FEWEST_RUNS:
         return Estimate(gap, np.nan, np.nan, count)
     half = _welch_t(x, y, 1.0, level) * np.sqrt(_variance_of_mean(x) + _variance_of_mean(y))
     return Estimate(gap, gap - half, gap + half, count)
@@ -88,7 +107,7 @@ def improvement_interval(ours: np.ndarray, baseline: np.ndarray, level: float = 
         return Estimate(np.nan, np.nan, np.nan, 0)
     m1, m2, count = float(x.mean()), float(y.mean()), min(len(x), len(y))
     ratio = m1 / m2
-    if count < 2:
+    if count < FEWEST_RUNS:
         return Estimate(ratio - 1, np.nan, np.nan, count)
     v1, v2 = _variance_of_mean(x), _variance_of_mean(y)
     t2 = _welch_t(x, y, ratio, level) ** 2
@@ -140,12 +159,12 @@ def stratified_bootstrap(
     """`statistic(samples)` with a percentile interval; seeds are resampled within each task.
 
     The statistic works along the last axis of its arrays: it gets [seeds] once and
-    [replicates, seeds] once. `size` is the smallest number of seeds of a task; with fewer than two
-    there is no interval.
+    [replicates, seeds] once. `size` is the smallest number of seeds of a task; with fewer than
+    `FEWEST_RUNS` there is no interval.
     """
     point = float(statistic(samples))
     count = min((len(values) for values in samples.values()), default=0)
-    if count < 2:
+    if count < FEWEST_RUNS:
         return Estimate(point, np.nan, np.nan, count)
     draws = statistic(_resample(samples, np.random.default_rng(seed), replicates))
     low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2])
@@ -197,8 +216,10 @@ def performance_profile(
 ) -> pd.DataFrame:
     """Share of runs whose normalised score exceeds each threshold, tasks weighted equally.
 
-    Returns columns threshold, mean, low, high (pointwise stratified bootstrap band).
+    Returns columns threshold, mean, low, high (pointwise stratified bootstrap band; nan where a
+    task has fewer than `FEWEST_RUNS`).
     """
+    few = min((len(values) for values in samples.values()), default=0) < FEWEST_RUNS
     draws = _resample(samples, np.random.default_rng(seed), replicates)
     rows = []
     for threshold in thresholds:
@@ -206,7 +227,8 @@ def performance_profile(
             np.mean([(np.asarray(v) > threshold).mean(-1) for v in drawn.values()], axis=0)
             for drawn in (samples, draws)
         )
-        rows.append((threshold, share, *np.quantile(band, [(1 - level) / 2, (1 + level) / 2])))
+        limits = np.quantile(band, [(1 - level) / 2, (1 + level) / 2])
+        rows.append((threshold, share, *((np.nan, np.nan) if few else limits)))
     return pd.DataFrame(rows, columns=["threshold", "mean", "low", "high"])
 
 
@@ -273,6 +295,11 @@ def scores_of(scores: pd.DataFrame, task: str, variant: str, metric: str) -> np.
     return chosen.sort_values("seed")["value"].to_numpy(float)
 
 
+def score_interval(scores: pd.DataFrame, task: str, variant: str, metric: str) -> Estimate:
+    """`mean_interval` of `scores_of`, within the metric's bounds."""
+    return mean_interval(scores_of(scores, task, variant, metric), bounds=bounds_of(metric))
+
+
 def normalised_samples(
     scores: pd.DataFrame, variant: str, metric: str, scale: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
@@ -323,7 +350,7 @@ def summarise(scores: pd.DataFrame, *, seed: int = 0) -> pd.DataFrame:
     rows = []
     for (task, variant, metric), group in scores.groupby(["task", "variant", "metric"], sort=False):
         values = group["value"].to_numpy(float)
-        interval = mean_interval(values)
+        interval = mean_interval(values, bounds=bounds_of(str(metric)))
         iqm = stratified_bootstrap({"task": values}, pooled_iqm, seed=seed)
         rows.append((task, variant, metric, *interval[:3], *iqm[:3], interval.size))
     columns = ["task", "variant", "metric", "mean", "low", "high",
@@ -351,7 +378,8 @@ def learning_curves(progress: pd.DataFrame, metric: str, *, window: int = 1) -> 
             values[index, inside] = np.interp(grid[inside], steps, smooth)
         for step, column in zip(grid, values.T, strict=True):
             if not np.isnan(column).all():
-                rows.append((task, variant, int(step), *mean_interval(column)))
+                interval = mean_interval(column, bounds=bounds_of(metric))
+                rows.append((task, variant, int(step), *interval))
     return pd.DataFrame(rows, columns=["task", "variant", "step", "mean", "low", "high", "count"])
 
 
@@ -360,11 +388,12 @@ def core_minutes(progress: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
 
     The log holds wall time; a run's processor time is spread over it evenly, so that a busy machine
     does not make an algorithm look slow. runs: the runs table with wall_s and cpu_s. Returns task,
-    variant, step, minutes.
+    variant, step, minutes; runs whose records do not say both times, or log none, have no part.
     """
     keys = ["task", "variant", "seed"]
+    timed = runs[(runs["cpu_s"] > 0) & (runs["wall_s"] > 0)]
     clock = progress[progress["metric"] == "time_wall_s"].merge(
-        runs.assign(busy=runs["cpu_s"] / runs["wall_s"])[[*keys, "busy"]], on=keys
+        timed.assign(busy=timed["cpu_s"] / timed["wall_s"])[[*keys, "busy"]], on=keys
     )
     clock["minutes"] = clock["value"] * clock["busy"] / 60
     return clock.groupby(["task", "variant", "step"], sort=False)["minutes"].mean().reset_index()

@@ -42,6 +42,14 @@ def typed(value: Any) -> Any:
     return [typed(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
+def assignment(text: str) -> tuple[str, Any]:
+    """Name and value of a NAME=VALUE of ``--set``."""
+    name, separator, value = text.partition("=")
+    if not separator or not name.strip():
+        raise UserError(f"--set {text}: write NAME=VALUE")
+    return name.strip(), typed(value)
+
+
 def show(value: Any) -> str:
     """A short one-line picture of any value for an error message."""
     text = ascii(value)

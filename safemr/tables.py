@@ -15,8 +15,13 @@ import numpy as np
 import pandas as pd
 
 from safemr import reference, statistics
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE
 from safemr.statistics import Estimate
 
+FEW = (
+    f"No interval stands where there are fewer than {statistics.FEWEST_RUNS} runs or all runs are "
+    "equal."
+)
 MISSING = "missing"
 ABSENT = "–"
 
@@ -53,8 +58,8 @@ class SafetyRule:
     task, whereas the authors' cost is a contact count on one and a depth on the other.
     """
 
-    tolerance: float = 1.0  # mean violating steps an episode, at most
-    clean_share: float = 0.95  # mean share of episodes without any violation, at least
+    tolerance: float = COST_TOLERANCE  # mean violating steps an episode, at most
+    clean_share: float = CLEAN_SHARE  # mean share of episodes without any violation, at least
     cost: str = "eval_cost_indicator"
     clean: str = "eval_zero_violation_share"
 
@@ -163,6 +168,7 @@ def table_one(
     """
     rule = rule or SafetyRule()
     rows = [_table_one_row(scores, task, rule, baselines) for task in tasks]
+    paper = [reference.TABLE_I.get(task) for task in tasks]
     data = pd.DataFrame(rows)
     lines: dict[str, list[str]] = {
         "SafeMR": [
@@ -181,11 +187,17 @@ def table_one(
         "Improvement [95% interval]": [
             _percent(r["improvement"], r["improvement_low"], r["improvement_high"]) for r in rows
         ],
-        "Paper: SafeMR": [number(r["paper_safemr"], 3) for r in rows],
-        "Paper: highest among safe": [number(r["paper_baseline"], 3) for r in rows],
-        "Paper: improvement, printed": [f"{r['paper_printed']:.1f}%" for r in rows],
-        "Paper: improvement, recomputed": [f"{r['paper_recomputed']:.1f}%" for r in rows],
     }
+    if any(paper):
+        lines |= {
+            f"Paper: {name}": [ABSENT if values is None else show(values) for values in paper]
+            for name, show in (
+                ("SafeMR", lambda values: f"{values.safemr:.3f}"),
+                ("highest among safe", lambda values: f"{values.best_safe:.3f}"),
+                ("improvement, printed", lambda values: f"{values.printed_improvement:.1f}%"),
+                ("improvement, recomputed", lambda values: f"{values.improvement:.1f}%"),
+            )
+        }
     highest, difference, improvement = list(lines.values())[1:4]
     for column, r in enumerate(rows):
         if r["baseline_runs"] and not r["baseline"]:
@@ -203,8 +215,8 @@ def table_one(
         "Table I. Efficiency of SafeMR against the best safe baseline: final return of the "
         "deterministic policy, mean over seeds with the half width of its 95% t interval; "
         "difference with Welch's, improvement with Fieller's 95% interval, which is not bounded "
-        f"where the baseline cannot be told from 0. {str(rule).capitalize()}. The best baseline is "
-        "chosen on the runs it is compared with."
+        f"where the baseline cannot be told from 0. {FEW} {str(rule).capitalize()}. The best "
+        "baseline is chosen on the runs it is compared with."
     )
     return Table("table1", caption, data, display, missing_notes(missing, tasks, None))
 
@@ -216,11 +228,13 @@ def full_results(
     rule: SafetyRule | None = None,
     metrics: Mapping[str, str] = RESULT_METRICS,
     name: str = "results",
+    layouts: int = 10,
 ) -> Table:
     """Every algorithm on every task; scripted reference lines are ordinary entries of `scores`.
 
     `data` has one row per (task, variant, metric) with mean, t interval, IQM and its bootstrap
-    interval; the printed cell is "mean ± half width", with the IQM after the return.
+    interval; the printed cell is `plus_minus`, with the IQM after the return. layouts: how many an
+    evaluation has.
     """
     rule = rule or SafetyRule()
     data = statistics.summarise(scores[scores["metric"].isin(list(metrics))])
@@ -235,24 +249,30 @@ def full_results(
     display = pd.DataFrame(rows, columns=["task", "algorithm", "seeds", "safe", *metrics.values()])
     caption = (
         "Full results: final performance of the deterministic policy (mean over the last 10% of "
-        "evaluations, on ten fixed layouts), mean over seeds ± half width of the 95% t interval; "
-        "from four seeds on the IQM in brackets. Cost is the authors' (pillars: contact steps of "
-        "the body; hazards: summed depth); any contact counts the robot's nose too; in all of "
-        "training: violating steps of a whole run, whose length differs between the families. "
+        f"evaluations, on {layouts} fixed layouts), mean over seeds ± half width of the 95% t "
+        f"interval, or [its ends] where it is cut off at a bound of the quantity. {FEW} From four "
+        "seeds on the IQM in brackets after the return. Cost is the authors' (pillars: contact "
+        "steps of the body; hazards: summed depth); any contact counts the robot's nose too; in "
+        "all of training: violating steps of a whole run, whose length differs between the "
+        "families. "
         f"{str(rule).capitalize()}. Scripted controllers see the full state and are not learned."
     )
     return Table(name, caption, data, display, missing_notes(missing, None, None))
 
 
-def push_split(scores: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
-    """Push returns split into approach, push and goal bonus, with the scripted lines."""
-    push = scores[scores["task"].str.endswith("Push")]
-    absent = None if missing is None else missing[missing["task"].str.endswith("Push")]
+def push_split(
+    scores: pd.DataFrame, tasks: Sequence[str], *, missing: pd.DataFrame | None = None
+) -> Table:
+    """Returns of the tasks with a box split into approach, push and goal bonus, with the scripted
+    lines."""
+    push = scores[scores["task"].isin(list(tasks))]
+    absent = None if missing is None else missing[missing["task"].isin(list(tasks))]
     table = full_results(push, missing=absent, metrics=REWARD_PARTS, name="push_split")
     caption = (
         "Push returns by part: approach is earned by walking to the box, push by bringing the box "
         "nearer to the goal, the bonus by goals reached. Mean over seeds ± half width of the 95% t "
-        "interval; from four seeds on the IQM in brackets. A return near that of touching the box "
+        f"interval, or [its ends] where it is cut off at a bound of the quantity. {FEW} From four "
+        "seeds on the IQM in brackets after the return. A return near that of touching the box "
         "says nothing about pushing."
     )
     return Table(table.name, caption, table.data, table.display, table.notes)
@@ -303,42 +323,54 @@ def best_safe_baseline(
 def compute(runs: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
     """What the runs cost: processor time, speed and memory of each variant on each task.
 
-    runs: the runs table (task, variant, seed, steps, cpu_s, wall_s, peak_rss_mb, cpu).
+    runs: the runs table (task, variant, seed, steps, cpu_s, wall_s, peak_rss_mb, cpu). Records from
+    outside need not say what they cost: means are over the runs that do, and a note counts the
+    others.
     """
-    rows = []
+    rows, silent = [], []
     for task, variant in entries(runs, None):
         chosen = runs[(runs["task"] == task) & (runs["variant"] == variant)]
-        core_s = float(chosen["cpu_s"].sum())
+        timed = chosen[chosen["cpu_s"] > 0]
+        core_s = float(timed["cpu_s"].sum()) if len(timed) else float("nan")
         rows.append(
             {
                 "task": task,
                 "variant": variant,
                 "runs": len(chosen),
                 "steps": int(chosen["steps"].iloc[0]),
-                "core_minutes": core_s / 60 / len(chosen),
-                "steps_per_core_s": chosen["steps"].sum() / core_s,
+                "core_minutes": core_s / 60 / max(len(timed), 1),
+                "steps_per_core_s": timed["steps"].sum() / core_s,
                 "peak_mb": float(chosen["peak_rss_mb"].max()),
                 "core_hours": core_s / 3600,
             }
         )
+        if len(timed) < len(chosen):
+            silent.append(f"{variant} on {task} ({len(chosen) - len(timed)} of {len(chosen)})")
     data = pd.DataFrame(rows)
+
+    def shown(name: str, form: str) -> list[str]:
+        return [ABSENT if np.isnan(value) else form.format(value) for value in data[name]]
+
     display = pd.DataFrame(
         {
             "task": data["task"],
             "algorithm": data["variant"],
             "runs": data["runs"],
             "steps a run": data["steps"].map("{:,}".format),
-            "core-minutes a run": data["core_minutes"].map("{:.1f}".format),
-            "steps a core-second": data["steps_per_core_s"].map("{:,.0f}".format),
-            "peak MB": data["peak_mb"].map("{:.0f}".format),
+            "core-minutes a run": shown("core_minutes", "{:.1f}"),
+            "steps a core-second": shown("steps_per_core_s", "{:,.0f}"),
+            "peak MB": shown("peak_mb", "{:.0f}"),
         }
     )
     hours, processors = data["core_hours"].sum(), ", ".join(sorted(set(runs["cpu"].dropna())))
     caption = (
         f"Compute of the {len(runs)} recorded runs: {hours:.1f} core-hours in all, one thread a "
-        f"run, evaluations included ({processors})."
+        f"run, evaluations included ({processors or 'no record names its processor'})."
     )
-    return Table("compute", caption, data, display, missing_notes(missing, None, None))
+    notes = [*missing_notes(missing, None, None)]
+    if silent:
+        notes.append(f"Records that do not say their processor time: {'; '.join(silent)}.")
+    return Table("compute", caption, data, display, notes)
 
 
 def describe_missing(missing: pd.DataFrame) -> str:
@@ -379,8 +411,9 @@ def entries(data: pd.DataFrame, missing: pd.DataFrame | None) -> list[tuple[str,
 
 
 def _task_order(tasks: pd.Series) -> pd.Series:
-    order = {task: index for index, task in enumerate(reference.TASKS)}
-    return tasks.map(lambda task: order.get(task, len(order)))
+    """The paper's tasks in its order, then the others as they come, each one's rows together."""
+    order = {task: index for index, task in enumerate(dict.fromkeys((*reference.TASKS, *tasks)))}
+    return tasks.map(order)
 
 
 def _summary_cell(chosen: pd.DataFrame, metric: str) -> str:
@@ -389,27 +422,35 @@ def _summary_cell(chosen: pd.DataFrame, metric: str) -> str:
     row = chosen.loc[metric]
     if metric in PERCENT_DIGITS:
         mean, low, high = 100 * row[["mean", "low", "high"]].to_numpy(float)
-        return plus_minus(mean, low, high, PERCENT_DIGITS[metric]) + "%"
+        return plus_minus(mean, low, high, PERCENT_DIGITS[metric], "%")
     cell = plus_minus(row["mean"], row["low"], row["high"], 0 if metric in _WHOLE else 2)
     middle = metric == "eval_return" and row["count"] >= 4  # of fewer, it is the mean
     return f"{cell} [{row['iqm']:.2f}]" if middle else cell
 
 
-def plus_minus(mean: object, low: object, high: object, digits: int) -> str:
-    """A mean and the half width of its interval as printed; nan is a missing run."""
+def plus_minus(mean: object, low: object, high: object, digits: int, unit: str = "") -> str:
+    """A mean and its interval as printed; nan is a missing run.
+
+    "mean ± half width", or "mean [low, high]" where the interval is not symmetric: it was cut off
+    at a bound. Runs that are all equal are no interval: the mean alone.
+    """
     estimate = Estimate(float(mean), float(low), float(high), 0)  # type: ignore[arg-type]
     if np.isnan(estimate.mean):
         return MISSING
-    if np.isnan(estimate.half_width):
-        return f"{estimate.mean:.{digits}f}"
-    return f"{estimate.mean:.{digits}f} ± {estimate.half_width:.{digits}f}"
+    shown = f"{estimate.mean:.{digits}f}"
+    if np.isnan(estimate.half_width) or estimate.low == estimate.high:
+        return shown + unit
+    above, below = estimate.high - estimate.mean, estimate.mean - estimate.low
+    if abs(above - below) > 1e-6 * (above + below):
+        return f"{shown}{unit} [{estimate.low:.{digits}f}, {estimate.high:.{digits}f}]"
+    return f"{shown} ± {estimate.half_width:.{digits}f}{unit}"
 
 
 def _percent(mean: object, low: object, high: object) -> str:
     value, lower, upper = 100 * np.array([mean, low, high], dtype=float)
     if np.isnan(value):
         return MISSING
-    if np.isnan(lower):
+    if np.isnan(lower) or lower == upper:
         return f"{value:+.1f}%"
     if np.isinf(lower):
         return f"{value:+.1f}% [not bounded]"

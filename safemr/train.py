@@ -1,6 +1,6 @@
 """One training run from a resolved configuration to its record.
 
-    python -m safemr.train --task Pillars-0.15-Goal --algorithm safemr --seed 100 --steps 100000
+    safemr train --task Pillars-0.15-Goal --algorithm safemr --seed 100 --steps 100000
 
 The pipeline calls the same program with ``--resolved`` (the run's configuration as JSON). Whatever
 the algorithm, this file evaluates, records, checkpoints and resumes; the algorithm only trains.
@@ -15,27 +15,18 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from safemr import records, runs
-from safemr.checkpoints import CHECKPOINT, RunSession
-from safemr.config import WANDB_MODES
+from safemr.config import WANDB_MODES, task_name
+from safemr.conventions import EVALUATION_SEED
 from safemr.errors import UserError, tell
-from safemr.strict_yaml import typed
+from safemr.signals import StoppedError, StopSignals
+from safemr.strict_yaml import assignment
+from safemr.tasks import make_envs
 
-
-def make_envs(task: Mapping[str, Any], num_envs: int) -> Any:
-    """A batched environment of a run's task: the ``task`` entry of its config."""
-    import gymnasium as gym
-
-    import envs  # noqa: F401  registers the tasks
-
-    return gym.make_vec(
-        f"{task['name']}-v0",
-        num_envs=num_envs,
-        vectorization_mode="vector_entry_point",
-        **task["settings"],
-    )
+if TYPE_CHECKING:
+    from safemr.checkpoints import RunSession
 
 
 class Progress:
@@ -80,13 +71,14 @@ def train(
     """Trains inside an open ``session``, continuing from its checkpoint where there is one.
 
     Raises UserError where the installed code is not the version that ``config`` asks for, and
-    `safemr.training.TrainingDivergedError` when a quantity stops being finite.
+    `safemr.training.TrainingDivergedError` when a quantity stops being finite or
+    becomes absurdly large.
     """
     import torch
 
     from safemr.evaluate import evaluate
     from safemr.mirror import Mirror
-    from safemr.training import check_finite
+    from safemr.training import check_parameters
 
     # One run is one thread: at these sizes more threads only wait for each other.
     torch.set_num_threads(1)
@@ -113,8 +105,7 @@ def train(
             begun, before = time.perf_counter(), trainer.step
             metrics = trainer.advance(min((before // log_every + 1) * log_every, steps))
             trained = time.perf_counter()
-            parameters = trainer.policy.network.parameters.detach()
-            check_finite(trainer.step, {"policy_parameters": float(parameters.sum())})
+            check_parameters(trainer.step, trainer.policy.network.parameters)
             if trainer.step // evaluation["every"] > before // evaluation["every"]:
                 result = evaluate(trainer.policy, evaluation_envs, evaluation["seed"])
                 metrics |= {f"eval_{name}": value for name, value in result.items()}
@@ -133,9 +124,18 @@ def train(
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m safemr.train", description=__doc__)
-    parser.add_argument("--task", help="for instance Pillars-0.15-Goal")
-    parser.add_argument("--algorithm", help="a file in safemr/algorithms, for instance safemr")
+    parser = argparse.ArgumentParser(
+        prog="safemr train",
+        description=__doc__,
+        epilog="Tasks, algorithms and what can be --set, with defaults and meaning: "
+        "`safemr list`, `safemr list ALGORITHM`.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    asked = {"-h", "--help"} & set(sys.argv[1:] if argv is None else argv)
+    tasks = ", ".join(runs.task_names()) if asked else ""  # imports the simulator
+    parser.add_argument("--task", help=f"one of {tasks}")
+    parser.add_argument("--task-name", help="what the task is called with settings of its own")
+    parser.add_argument("--algorithm", help=f"one of {', '.join(runs.algorithm_names())}")
     parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
     parser.add_argument("--steps", type=int, default=320_000, help="environment steps")
     parser.add_argument(
@@ -147,7 +147,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--log-points", type=int, default=20, help="rows of progress.csv")
     parser.add_argument("--eval-episodes", type=int, default=10)
-    parser.add_argument("--eval-seed", type=int, default=10_000)
+    parser.add_argument("--eval-seed", type=int, default=EVALUATION_SEED)
     parser.add_argument(
         "--resolved", help="a run's complete configuration as JSON, or a file of it"
     )
@@ -162,13 +162,6 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--die-with-parent", action="store_true", help="stop when the parent process is gone"
     )
     return parser.parse_args(argv)
-
-
-def _override(text: str) -> tuple[str, Any]:
-    name, separator, value = text.partition("=")
-    if not separator or not name:
-        raise UserError(f"--set {text}: write NAME=VALUE")
-    return name.strip(), typed(value)
 
 
 def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
@@ -188,18 +181,21 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
-    overrides = dict(map(_override, arguments.set))
+    overrides = dict(map(assignment, arguments.set))
     settings = {
         name.removeprefix("task."): overrides.pop(name)
         for name in list(overrides)
         if name.startswith("task.")
     }
+    task = _task(arguments, settings)
     algorithm = runs.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
+    values = runs.hyperparameters(algorithm, overrides, "--set")
+    runs.check_setting(algorithm, values, task, arguments.steps, arguments.algorithm)
     run = runs.make_run(
-        runs.describe_task(arguments.task, settings, "--task"),
+        task,
         algorithm,
-        runs.hyperparameters(algorithm, overrides, "--set"),
+        values,
         variant=arguments.variant or arguments.algorithm,
         seed=arguments.seed,
         steps=arguments.steps,
@@ -213,40 +209,30 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     return json.loads(records.canonical_json(run.config)), run.variant
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit status (2 user error, 3 locked, 4 diverged)."""
-    from safemr.training import TrainingDivergedError
+def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The task's entry; settings that make another task of it need a name."""
+    if arguments.task_name is None:
+        task = runs.describe_task(arguments.task, settings, "--task")
+        runs.check_name(task, "--set", "give it with --task-name")
+        return task
+    name = task_name(arguments.task_name, "--task-name")
+    runs.describe_task(arguments.task, settings, "--task")
+    return runs.describe_task(name, settings, "--task-name", base=arguments.task)
 
+
+def main(argv: Sequence[str] | None = None, signals: StopSignals | None = None) -> int:
+    """Runs the command line; returns the exit status (2 user error, 3 locked, 4 diverged, 128 and
+    the number of the signal that ended it). ``signals``: handlers that outlive this call."""
+    if signals is None:
+        with StopSignals() as own:
+            return main(argv, own)
     arguments = _parse(argv)
     try:
-        config, variant = resolve(arguments)
-        label = f"{variant} {config['task']['name']} seed {config['seed']}"
-        with RunSession(
-            config,
-            variant,
-            arguments.root,
-            wait=arguments.wait,
-            die_with_parent=arguments.die_with_parent,
-        ) as session:
-            if session.complete:
-                tell(f"{label}: already recorded in {session.folder}")
-                return 0
-            try:
-                train(
-                    config,
-                    session,
-                    label=label,
-                    wandb={"mode": arguments.wandb, "project": arguments.wandb_project},
-                )
-            except TrainingDivergedError as error:
-                session.fail(str(error))
-                last = int(session.rows[-1]["step"]) if session.rows else 0
-                path = session.work / CHECKPOINT
-                kept = f"last good checkpoint: {path}" if path.exists() else "no checkpoint yet"
-                tell(f"error: {label}: {error}; last good log point: step {last}; {kept}")
-                return 4
-            tell(f"{label}: record in {session.folder}")
-            return 0
+        return _run(arguments, signals)
+    except StoppedError as error:
+        name = error.number.name
+        tell(f"stopped at once by {name}; the same command continues from the last checkpoint")
+        return 128 + error.number
     except UserError as error:
         tell(f"error: {error}")
         return int(getattr(error, "exit_code", 2))
@@ -255,5 +241,42 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
 
 
+def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
+    # They import torch, which takes seconds, in which a signal shall not end in a traceback.
+    from safemr.checkpoints import CHECKPOINT, RunSession
+    from safemr.training import TrainingDivergedError
+
+    config, variant = resolve(arguments)
+    label = f"{variant} {config['task']['name']} seed {config['seed']}"
+    with RunSession(
+        config,
+        variant,
+        arguments.root,
+        wait=arguments.wait,
+        die_with_parent=arguments.die_with_parent,
+        signals=signals,
+    ) as session:
+        if session.complete:
+            tell(f"{label}: already recorded in {session.folder}")
+            return 0
+        try:
+            train(
+                config,
+                session,
+                label=label,
+                wandb={"mode": arguments.wandb, "project": arguments.wandb_project},
+            )
+        except TrainingDivergedError as error:
+            session.fail(str(error))
+            last = int(session.rows[-1]["step"]) if session.rows else 0
+            path = session.work / CHECKPOINT
+            kept = f"last good checkpoint: {path}" if path.exists() else "no checkpoint yet"
+            tell(f"error: {label}: {error}; last good log point: step {last}; {kept}")
+            return 4
+        tell(f"{label}: record in {session.folder}")
+        return 0
+
+
 if __name__ == "__main__":
-    raise SystemExit(main())
+    # Until the process has ended: a late signal would make Snakemake remove the finished record.
+    raise SystemExit(main(signals=StopSignals().install()))

@@ -9,7 +9,7 @@ form is exact and no second derivative of the network is needed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -26,17 +26,15 @@ class TrustRegionConfig:
     """The trust region's part of an algorithm's hyperparameters; its radius is ``target_kl``."""
 
     damping: float = 0.1  # added to the diagonal of the Fisher matrix
-    conjugate_gradient_iterations: int = 10
-    backtrack_factor: float = 0.8
-    backtrack_iterations: int = 10
+    conjugate_gradient_iterations: int = 10  # for a product with the inverse Fisher matrix
+    backtrack_factor: float = 0.8  # by which the line search shortens a refused step
+    backtrack_iterations: int = 10  # trials of the line search
 
-    POSITIVE: ClassVar[tuple[str, ...]] = (
-        "conjugate_gradient_iterations",
-        "backtrack_factor",
-        "backtrack_iterations",
-    )
-    NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ("damping",)
-    SHARES: ClassVar[tuple[str, ...]] = ("backtrack_factor",)
+    RANGES: ClassVar[Mapping[str, str]] = {
+        "damping": "[0, 1000]",
+        **dict.fromkeys(("conjugate_gradient_iterations", "backtrack_iterations"), "[1, 1000]"),
+        "backtrack_factor": "(0, 1)",
+    }
 
 
 def dot(a: Tensor, b: Tensor) -> float:

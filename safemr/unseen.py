@@ -17,7 +17,7 @@ from safemr import evaluate, records, reference, statistics
 from safemr.controllers import SCORE_COLUMNS
 from safemr.measurements import Measurements
 from safemr.statistics import Estimate
-from safemr.tables import ABSENT, SafetyRule, Table, entries, plus_minus
+from safemr.tables import ABSENT, FEW, SafetyRule, Table, entries, plus_minus
 
 
 def measured_scores(
@@ -42,14 +42,19 @@ def measured_scores(
 
 
 def table(
-    flown: pd.DataFrame, scores: pd.DataFrame, *, episodes: int, rule: SafetyRule | None = None
+    flown: pd.DataFrame,
+    scores: pd.DataFrame,
+    *,
+    episodes: int,
+    rule: SafetyRule | None = None,
+    layouts: int = 10,
 ) -> Table:
     """A row an algorithm and task: return, its change against the final evaluations, how far it is
     behind SafeMR's, violations.
 
-    flown: `measured_scores`. scores: `statistics.final_scores`. The upper end is Clopper and
-    Pearson's one-sided 95% bound on the probability that an episode has a violation, as if all
-    episodes of all seeds were independent.
+    flown: `measured_scores`. scores: `statistics.final_scores`, of evaluations on ``layouts``. The
+    upper end is Clopper and Pearson's one-sided 95% bound on the probability that an episode has a
+    violation, as if all episodes of all seeds were independent.
     """
     rule = rule or SafetyRule()
     rows = []
@@ -64,7 +69,7 @@ def table(
         gap = statistics.difference_interval(method, ours["eval_return"])
         if variant == reference.METHOD:
             gap = Estimate(float("nan"), float("nan"), float("nan"), 0)
-        steps = statistics.mean_interval(ours[rule.cost])
+        steps = statistics.score_interval(flown, task, variant, rule.cost)
         total = episodes * len(ours[rule.clean])
         dirty = round(float((episodes * (1 - ours[rule.clean])).sum()))
         bound = 1.0 if dirty == total else float(stats.beta.ppf(0.95, dirty + 1, total - dirty))
@@ -100,7 +105,8 @@ def table(
     caption = (
         f"Final policies on {episodes} layouts that no run was evaluated on, the same for all: "
         "mean over seeds ± half width of the 95% t interval; what it changes against the final "
-        "evaluations on ten layouts; SafeMR's return minus this one, with Welch's interval; at "
+        f"evaluations on {layouts} layouts; SafeMR's return minus this one, with Welch's interval; "
+        f"[the ends] of an interval that is cut off at 0. {FEW} At "
         "most: one-sided 95% bound on the probability that an episode has a violation, as if all "
         f"episodes were independent. {str(rule).capitalize()}; here applied to these episodes."
     )

@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -86,43 +85,12 @@ def test_dynamics_reject_nonsense(field: str, value: Any):
         AircraftDynamics(**{field: value})
 
 
-def test_scalar_environment_passes_gymnasiums_checker():
-    check_env(gymnasium.make("Aircraft-v0", render_mode="rgb_array").unwrapped)
-
-
 def vector(num_envs: int, **arguments: Any) -> AircraftVectorEnv:
     made = gymnasium.make_vec(
         "Aircraft-v0", num_envs, vectorization_mode="vector_entry_point", **arguments
     )
     assert isinstance(made, AircraftVectorEnv)
     return made
-
-
-def test_batch_repeats_scalar_environments_through_autoresets():
-    batch, singles = vector(5), [AircraftEnv() for _ in range(5)]
-    observations, infos = batch.reset(seed=11)
-    expected = [single.reset(seed=11 + i) for i, single in enumerate(singles)]
-    np.testing.assert_array_equal(observations, [observation for observation, _ in expected])
-    generator, ended = np.random.default_rng(0), 0
-    for _ in range(150):
-        actions = generator.uniform(-2, 2, (5, 1)).astype(np.float32)
-        observations, rewards, terminated, truncated, infos = batch.step(actions)
-        for i, single in enumerate(singles):
-            observation, reward, done, over, info = single.step(actions[i])
-            assert (rewards[i], terminated[i], truncated[i]) == (reward, done, over)
-            for key in info.keys() - {"d", "d_dot"}:
-                assert infos[key][i] == info[key]
-            if done or over:
-                ended += 1
-                assert infos["_final_obs"][i]
-                np.testing.assert_array_equal(infos["final_obs"][i], observation)
-                for key, value in info.items():
-                    np.testing.assert_array_equal(infos["final_info"][key][i], value)
-                observation, info = single.reset()
-            np.testing.assert_array_equal(observations[i], observation)
-            np.testing.assert_array_equal(infos["d"][i], info["d"])
-            np.testing.assert_array_equal(infos["d_dot"][i], info["d_dot"])
-    assert ended > 10
 
 
 def test_info_reports_the_state_reached():
@@ -167,29 +135,6 @@ def test_ends_of_an_episode(
     assert info["cost"] == info["cost_indicator"] == info["cost_contact"] == cost
 
 
-@pytest.mark.parametrize(
-    ("actions", "message"),
-    [
-        (np.array([[0.0], [np.nan], [0.0]], np.float32), "action nan of encounter 1"),
-        (np.array([[0.0], [np.inf], [0.0]], np.float32), "action inf of encounter 1"),
-        (np.zeros(3), "shape"),
-        (np.zeros((2, 1)), "shape"),
-        (np.zeros((3, 2)), "shape"),
-        (np.float32(0.0), "shape"),
-        ([["a"]] * 3, "real numbers"),
-        ([[1j]] * 3, "real numbers"),
-        ([[None]] * 3, "real numbers"),
-    ],
-)
-def test_bad_actions_are_named_and_change_nothing(actions: Any, message: str):
-    batch = vector(3)
-    batch.reset(seed=0)
-    before = batch.get_state()
-    with pytest.raises(ValueError, match=f"action.*{message}|{message}"):
-        batch.step(actions)
-    np.testing.assert_equal(batch.get_state(), before)
-
-
 def test_starts_fill_the_box_outside_the_disc():
     batch = vector(4000)
     observations, infos = batch.reset(seed=3)
@@ -200,23 +145,6 @@ def test_starts_fill_the_box_outside_the_disc():
     mean_x = area * 7.0 / (area - 25 * np.pi)
     assert observations[:, 0].mean() == pytest.approx(mean_x, abs=0.35)
     assert observations[:, 1:].mean(axis=0) == pytest.approx([0, 0, 0], abs=0.35)
-
-
-def test_a_restored_environment_continues_bit_identically():
-    original, restored = vector(6, other_turn=0.5), vector(6, other_turn=0.5)
-    original.reset(seed=5)
-    actions = np.random.default_rng(1).uniform(-1, 1, (120, 6, 1)).astype(np.float32)
-    for action in actions[:60]:
-        original.step(action)
-    restored.set_state(original.get_state())
-    for action in actions[60:]:
-        for one, other in zip(original.step(action), restored.step(action), strict=True):
-            if isinstance(one, dict):
-                np.testing.assert_array_equal(one["d"], other["d"])
-            else:
-                np.testing.assert_array_equal(one, other)
-    with pytest.raises(ValueError, match="6 encounters"):
-        vector(2).set_state(original.get_state())
 
 
 def test_picture_shows_both_aircraft():

@@ -15,6 +15,7 @@ from matplotlib.colors import to_hex
 from envs.aircraft import AircraftVectorEnv
 from safemr import aircraft, aircraft_evidence, config, records, runs, statistics
 from safemr.aircraft_evidence import TrueSets
+from safemr.conventions import COVERS
 from safemr.energy import in_metres
 from safemr.errors import UserError
 from safemr.measurements import Measurements
@@ -66,11 +67,18 @@ def turning(rate: float, **extras: Any) -> dict[str, np.ndarray]:
     return arrays
 
 
-def write(root: Path, variant: str, seed: int, policy: dict[str, np.ndarray] | None) -> None:
+def write(
+    root: Path,
+    variant: str,
+    seed: int,
+    policy: dict[str, np.ndarray] | None,
+    task: Any = "Aircraft",
+    algorithm: str = "fac",
+) -> None:
     hyperparameters = {"eta": 0.01}
-    described = {"name": "fac", "version": 1, "hyperparameters": hyperparameters}
+    described = {"name": algorithm, "version": 1, "hyperparameters": hyperparameters}
     run: dict[str, Any] = {
-        **{"schema": 1, "task": runs.describe_task("Aircraft", {}), "algorithm": described},
+        **{"schema": 1, "task": runs.installed(task), "algorithm": described},
         **{"seed": seed, "steps": 10, "log_every": 10},
         "evaluation": {"every": 10, "episodes": 1, "seed": 0},
     }
@@ -192,7 +200,7 @@ def test_without_any_run_the_references_remain(sets: TrueSets, tmp_path: Path) -
     table = aircraft_evidence.comparison_table(comparison, none)
     assert table.notes == ()
     assert set(aircraft_evidence.CERTIFICATES) <= set(table.display["certificate"])
-    pictures.frontier(FRONTIER, comparison, aircraft.COVERS)
+    pictures.frontier(FRONTIER, comparison, COVERS)
 
 
 def test_records_that_do_not_say_their_certificate_are_all_named(
@@ -242,7 +250,7 @@ def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
 
 
 def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
-    figure = pictures.frontier(FRONTIER, comparison, aircraft.COVERS)
+    figure = pictures.frontier(FRONTIER, comparison, COVERS)
     (ax,) = figure.axes
     shown = {
         to_hex(line.get_color()): line.get_xydata()
@@ -298,3 +306,81 @@ def test_the_papers_grid_has_the_same_learners_as_the_quick_one() -> None:
     quick.pop("SafeMR-metres")
     papers = {k: v for k, v in quick.items() if v["algorithm"] != "neural_safemr"}
     assert papers == paper
+
+
+# --- other traffic -------------------------------------------------------------------------------
+
+MIRRORED = {"name": "Aircraft-left", "base": "Aircraft", "settings": {"other_turn": -1.0}}
+
+
+@pytest.fixture(scope="module")
+def mirrored() -> TrueSets:
+    grid = Grid(shape=(66, 66, 48))
+    return TrueSets(lambda case: solve(case, grid), 13, MIRRORED)
+
+
+def certified(rate: float = 0.5) -> dict[str, np.ndarray]:
+    return turning(rate, zeta=np.array((0.06, 1.0, 1.0), np.float32), length_scale=np.array(5.0))
+
+
+def test_the_true_set_is_that_of_the_tasks_traffic(sets: TrueSets, mirrored: TrueSets) -> None:
+    """Traffic that turns left instead of right is the mirror image of the encounter."""
+    states = sets.truth.states[:2000]
+    x, y, psi = states.T
+    image = mirrored.constant(np.stack([x, -y, 2 * np.pi - psi], -1))
+    np.testing.assert_allclose(image, sets.constant(states), atol=0.05)
+    assert np.abs(mirrored.constant(states) - sets.constant(states)).max() > 1
+
+
+def test_a_record_is_held_against_the_true_set_of_its_own_traffic(
+    sets: TrueSets, mirrored: TrueSets, comparison: pd.DataFrame, tmp_path: Path
+) -> None:
+    write(tmp_path, "SafeMR", 0, certified(), MIRRORED)
+    index = records.read_records(tmp_path)[0]
+    with pytest.raises(UserError, match=r"flew with other_turn = -1, the true .* that of 1"):
+        aircraft_evidence.compare(sets, FRONTIER, tmp_path, index, flights=50)
+    found = aircraft_evidence.compare(mirrored, FRONTIER, tmp_path, index, flights=50)
+    ours = found[found["variant"] == "SafeMR"].iloc[0]
+    # The energy is its own mirror image, so its shares are those of the right-turning traffic.
+    straight = comparison[(comparison["variant"] == "JointSIS") & (comparison["seed"] == 100)].iloc[
+        0
+    ]
+    for metric in ("volume_ratio", "missed_share", "iou"):
+        assert ours[metric] == pytest.approx(straight[metric], abs=0.02)
+    assert aircraft_evidence.comparison_table(found, task=MIRRORED).caption.startswith(
+        "Aircraft-left. "
+    )
+
+
+def test_kept_measurements_of_the_registered_traffic_keep_their_names(
+    sets: TrueSets, mirrored: TrueSets
+) -> None:
+    assert sets.kept_as("frontier") == ("frontier", {})
+    entry = runs.describe_task("Aircraft", {})
+    assert TrueSets(sets._solve, 13, entry).kept_as("slices") == ("slices", {})
+    assert mirrored.kept_as("frontier") == (
+        "frontier Aircraft-left", {"task": runs.installed(MIRRORED)}
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        ("Pillars-0.15-Goal", "no encounter of two aircraft"),
+        ({**MIRRORED, "settings": {"other_turn": 2.0}}, "at most 1 rad/s"),
+        ({**MIRRORED, "settings": {"d_min": 3.0}}, "no true unsafe set is solved for its d_min"),
+    ],
+)
+def test_a_task_without_a_true_set_is_refused(task: Any, expected: str) -> None:
+    with pytest.raises(UserError, match=expected):
+        TrueSets(lambda case: None, 13, task)
+
+
+def test_a_neural_certificate_is_not_compared_as_its_fixed_part(
+    sets: TrueSets, tmp_path: Path
+) -> None:
+    network = {"certificate_parameters": np.zeros(3)}
+    write(tmp_path, "Neural", 0, {**certified(), **network}, algorithm="neural_safemr")
+    index = records.read_records(tmp_path)[0]
+    with pytest.raises(UserError, match=r"neural_safemr is a network beside a fixed"):
+        aircraft_evidence.compare(sets, FRONTIER, tmp_path, index, flights=50)

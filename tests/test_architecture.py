@@ -135,6 +135,19 @@ def test_compiled_code_holds_nothing_from_other_modules(path: Path) -> None:
             assert not used & foreign, f"{path}: {node.name} keeps a copy of {used & foreign}"
 
 
+def test_constants_have_one_home() -> None:
+    """One name with one value in two files is one decision that can be changed in one of them."""
+    paths = [*SOURCES, *(p.relative_to(ROOT) for p in (ROOT / "workflow/scripts").glob("*.py"))]
+    homes: dict[tuple[str, str], list[str]] = {}
+    for path in paths:
+        for node in ast.parse((ROOT / path).read_text()).body:
+            targets = node.targets if isinstance(node, ast.Assign) else []
+            for name in (target.id for target in targets if isinstance(target, ast.Name)):
+                if name.isupper() and name != "VERSION":
+                    homes.setdefault((name, ast.unparse(node.value)), []).append(str(path))
+    assert {key: found for key, found in homes.items() if len(found) > 1} == {}
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=str)
 def test_files_stay_readable(path: Path) -> None:
     assert len((ROOT / path).read_text().splitlines()) <= 450

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sample_record import CONFIG, ROWS
 
-from safemr import certify, falsification, reference
+from safemr import certify, falsification, records, reference
 from safemr.energy import energy
 from safemr.errors import UserError
 from safemr.falsification import ROBOT
 from safemr.feasibility import analytic_condition, radial_requirement
+from safemr.measurements import Measurements
 from safemr.point_robot import PointRobot
 from safemr.reference import Zeta
 
+ROOT = Path(__file__).resolve().parents[1]
 LEARNED = list(reference.TABLE_II.values())
 D_MIN = 0.25
+TASK = "Pillars-0.15-Goal"
 
 
 @pytest.fixture(scope="module", params=["Pillars-0.15-Goal", "Hazards-0.30-Push"])
@@ -30,7 +36,7 @@ def simulator(request):
 
 @pytest.fixture(scope="module")
 def pillars():
-    envs = falsification.make_simulator("Pillars-0.15-Goal")
+    envs = falsification.make_simulator(TASK)
     yield envs
     envs.close()
 
@@ -134,7 +140,7 @@ def test_action_grid_resolves_thrust_and_servo():
 
 def test_search_is_seeded_and_its_example_replays(pillars):
     first, second = (
-        falsification.falsify(pillars, LEARNED[1], count=512, rounds=3) for _ in range(2)
+        falsification.falsify(pillars, TASK, LEARNED[1], count=512, rounds=3) for _ in range(2)
     )
     np.testing.assert_array_equal(first.margin, second.margin)
     assert first.worst_margin == second.worst_margin
@@ -146,7 +152,7 @@ def test_search_is_seeded_and_its_example_replays(pillars):
 
 
 def test_refinement_finds_that_no_learned_set_is_feasible_everywhere(pillars):
-    result = falsification.falsify(pillars, LEARNED[0], count=1024)
+    result = falsification.falsify(pillars, TASK, LEARNED[0], count=1024)
     assert result.worst_margin > 0.01
     _distance, bearing, course, speed, turn_rate = result.worst_state
     # sideways, closing in fast, turning as fast as the servo can
@@ -157,9 +163,9 @@ def test_refinement_finds_that_no_learned_set_is_feasible_everywhere(pillars):
 
 
 def test_distance_alone_leaks_and_a_strong_velocity_term_does_not(pillars):
-    bare = falsification.falsify(pillars, reference.PHI_0, count=2048, rounds=1)
+    bare = falsification.falsify(pillars, TASK, reference.PHI_0, count=2048, rounds=1)
     assert bare.leak_share > 0.005  # too fast to stop within one step of contact
-    strong = falsification.falsify(pillars, Zeta(0.3, 3.0, 1.0), count=2048, rounds=1)
+    strong = falsification.falsify(pillars, TASK, Zeta(0.3, 3.0, 1.0), count=2048, rounds=1)
     assert strong.leak_share == 0.0
 
 
@@ -193,7 +199,7 @@ class Constant:
 
 
 def test_a_resting_robot_never_violates_and_a_rammer_could_have_done_otherwise():
-    task = "Pillars-0.15-Goal"
+    task = TASK
     resting = falsification.check_policy(Constant(0, 0), task, LEARNED[0], num_envs=4, steps=20)
     assert resting.steps == 80
     assert resting.violating == 0
@@ -221,7 +227,7 @@ def test_command_prints_four_verdicts_and_writes_table_picture_and_examples(tmp_
     assert names == {"certificates.csv", "certificates.md", "certificates.tex",
                      "certificates.pdf", "certificates.png", "examples.json"}  # fmt: skip
     assert certify.main(["--replay", str(tmp_path / "examples.json")]) == 0
-    assert "mine: 100 actions" in capsys.readouterr().out
+    assert "mine on Pillars-0.15-Goal: 100 actions" in capsys.readouterr().out
 
 
 def test_without_parameters_the_papers_certificates_are_checked():
@@ -235,8 +241,139 @@ def test_without_parameters_the_papers_certificates_are_checked():
     [(["--sigma", "0.2"], "--k"), (["--sigma", "-1", "--k", "1", "--n", "2"], "negative"),
      (["--record", "x", "--k", "1"], "--record"), (["--replay", "nowhere.json"], "nowhere.json"),
      (["--sigma", "0.3", "--k", "3", "--n", "0.1"], "no bounded search"),
-     (["--task", "Aircraft"], "point robot")],
+     (["--task", "Aircraft"], "point robot"),
+     (["--task", "Pillars-0.15-Gaol"], "Pillars-0.15-Goal"),
+     (["--set", "task.obstacle_sise=0.3"], "obstacle_size"), (["--set", "gamma=0.9"], "task.NAME"),
+     (["--set", "task.obstacle_size"], "NAME=VALUE"),
+     (["--record", "x", "--task", "Pillars-0.30-Goal"], "--task: a record says its own"),
+     (["--record", "x", "--set", "task.obstacle_size=0.3"], "--set: a record says its own"),
+     (["--record", "x", "--eta", "0.1"], "--eta: a record says its own")],
 )  # fmt: skip
 def test_bad_requests_are_named(arguments, culprit):
     with pytest.raises(UserError, match=culprit):
         certify.main([*arguments, "--states", "64"])
+
+
+# --- a task with other settings ------------------------------------------------------------------
+
+LARGE = {"name": "Large", "version": 1, "settings": {"obstacle_size": 0.3}, "base": TASK}
+ZETA = ["--sigma", "0.2", "--k", "0.8", "--n", "2.1", "--name", "mine", "--states", "256"]
+
+
+def record_on(root: Path, task: dict[str, Any], algorithm: str = "fac", **arrays: Any) -> Path:
+    """A record that logs a zeta."""
+    described = {"name": algorithm, "version": 1, "hyperparameters": {"gamma": 0.99}}
+    config = {**CONFIG, "task": task, "algorithm": described}
+    rows = [{**row, "sigma": 0.2, "k": 0.8, "n": 2.1} for row in ROWS]
+    folder = root / records.record_path(config, "FAC-phih")
+    records.write_record(folder, config, "FAC-phih", rows, {}, arrays or None)
+    return folder
+
+
+def test_the_search_covers_the_distances_of_the_settings():
+    """With obstacles of 0.3 m the robot's centre must stay 0.4 m away: no state is nearer."""
+    certificate = certify.Certificate("mine", Zeta(0.2, 0.8, 2.1))
+    (_, plain), (row, search) = (
+        certify.certify(certificate, task, states=256) for task in (TASK, LARGE)
+    )
+    assert plain.states[:, 0].min() < 0.3
+    assert search.states[:, 0].min() >= 0.4
+    assert row["task"] == "Large"
+    assert search.confirmed == search.examined, "the simulator has the same obstacles"
+    expected = analytic_condition(certificate.zeta, 0.4)["margin"].tolist()
+    found = [value for name, value in row.items() if name.startswith("margin_")]
+    assert found == expected
+    assert certify.margin_map(LARGE, certificate.zeta, distances=3, bearings=3)[
+        "distance"
+    ].min() == pytest.approx(0.4)
+
+
+def test_the_command_line_and_a_record_certify_the_same_task(tmp_path, capsys):
+    folder = record_on(tmp_path, LARGE)
+    assert certify.main(["--record", str(folder), "--states", "256"]) == 0
+    recorded = capsys.readouterr().out
+    assert certify.main([*ZETA, "--set", "task.obstacle_size=0.3"]) == 0
+    given = capsys.readouterr().out
+    assert "| Large |" in recorded
+    assert "| Pillars-0.15-Goal with obstacle_size=0.3 |" in given
+    worst = [json.loads(out.partition("worst state of ")[2].partition(": ")[2])
+             for out in (recorded, given)]  # fmt: skip
+    for example in worst:
+        assert example.pop("base") == TASK
+        assert example["settings"] == {"obstacle_size": 0.3}
+        assert example["state"]["distance"] >= 0.4
+        del example["task"]
+    assert worst[0] == worst[1]
+
+
+def test_a_replay_is_on_the_task_of_its_example_and_on_no_other(tmp_path, capsys):
+    settings = ["--set", "task.obstacle_size=0.3"]
+    certify.main([*ZETA, *settings, "--out", str(tmp_path)])
+    file = tmp_path / "examples.json"
+    for matching in ([], settings, [*settings, "--task", TASK]):
+        assert certify.main(["--replay", str(file), *matching]) == 0
+    assert "the file says" not in capsys.readouterr().out
+    title = "mine on Pillars-0.15-Goal with obstacle_size=0.3"
+    for other, named in (
+        (["--set", "task.obstacle_size=0.2"], "Pillars-0.15-Goal with obstacle_size=0.2"),
+        (["--task", "Pillars-0.30-Goal", *settings], "Pillars-0.30-Goal with obstacle_size=0.3"),
+        (["--task", TASK], "Pillars-0.15-Goal"),
+    ):
+        with pytest.raises(UserError) as caught:
+            certify.main(["--replay", str(file), *other])
+        message = f"{title} is an example of {title.removeprefix('mine on ')}, not of {named}"
+        assert str(caught.value).endswith(message)
+    # A file of before, which forgot the settings: it does not come out as it says.
+    ((name, example),) = json.loads(file.read_text()).items()
+    del example["settings"], example["base"]
+    example["task"] = TASK
+    file.write_text(json.dumps({name: example}))
+    assert certify.main(["--replay", str(file)]) == 1
+    assert "the file says" in capsys.readouterr().out
+    example["settings"] = {"obstacle_sise": 0.3}
+    file.write_text(json.dumps({name: example}))
+    with pytest.raises(UserError, match="obstacle_size"):
+        certify.main(["--replay", str(file)])
+
+
+def test_the_examples_that_the_repository_keeps_come_out_as_they_say(capsys):
+    file = ROOT / "results/tables/certificate_examples.json"
+    assert certify.main(["--replay", str(file)]) == 0
+    assert capsys.readouterr().out.count("no action is safe") == len(json.loads(file.read_text()))
+
+
+def test_kept_measurements_of_other_settings_are_others(tmp_path):
+    kept = Measurements(tmp_path)
+    certificate = certify.Certificate("mine", Zeta(0.2, 0.8, 2.1))
+    plain = {"name": TASK, "version": 1, "settings": {}}
+    rows, maps = [], []
+    for task in (plain, LARGE, {**LARGE, "name": "Larger", "settings": {"obstacle_size": 0.4}}):
+        rows.append(certify.measured_certificate(kept, certificate, task, states=64, episodes=1))
+        maps.append(certify.measured_margins(kept, certificate, task))
+    assert len({row["worst_margin"] for row, _ in rows}) == 3
+    assert [d_min for _, d_min in maps] == pytest.approx([0.25, 0.4, 0.5])
+    assert [example.get("settings") for _, example in rows] == [
+        None, {"obstacle_size": 0.3}, {"obstacle_size": 0.4}
+    ]  # fmt: skip
+
+
+def test_equal_titles_are_numbered_so_that_no_example_is_lost():
+    jobs = [(certify.Certificate("a", Zeta(0, 0, 1)), task) for task in (TASK, LARGE, TASK, TASK)]
+    titles = certify.example_titles(jobs)
+    assert titles == [f"a on {TASK}", "a on Large", f"a on {TASK}, 2", f"a on {TASK}, 3"]
+
+
+# --- an energy function that is more than its zeta -----------------------------------------------
+
+
+@pytest.mark.parametrize("by", ["algorithm", "policy"])
+def test_a_neural_record_is_not_certified_as_its_fixed_part(tmp_path, by):
+    task = {"name": TASK, "version": 1, "settings": {}}
+    if by == "algorithm":  # its policy.npz is optional
+        folder = record_on(tmp_path, task, "neural_safemr")
+    else:  # an algorithm of somebody else's, that saves such a network
+        folder = record_on(tmp_path, task, "fac", certificate_parameters=np.zeros(3))
+    with pytest.raises(UserError, match=r"is a network beside a fixed \[sigma, k, n\]") as caught:
+        certify.main(["--record", str(folder)])
+    assert str(folder) in str(caught.value)
+    assert "--sigma --k --n" in str(caught.value)

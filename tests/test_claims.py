@@ -48,13 +48,15 @@ def test_highest_return_follows_the_interval_of_the_difference(scores, shift, ex
 
 
 def test_the_methods_certificates_are_its_own_and_those_of_its_points():
-    row = {"infeasible_share": 0.0, "margin_inside_aligned": 1.0, "margin_outside_aligned": 1.0,
+    row = {"task": TASK, "infeasible_share": 0.0,
+           "margin_inside_aligned": 1.0, "margin_outside_aligned": 1.0,
            "margin_inside_drag": -1.0, "margin_outside_drag": -1.0}  # fmt: skip
+    elsewhere = {**row, "certificate": "SafeMR (seed 0)", "worst_margin": 0.5, "task": "Pillars-8"}
     names = {"SafeMR (seed 0)": -0.1, "SafeMR[0.45,0.15] (seed 0)": -0.2,
              "SafeMR-literal (seed 0)": 0.3, "paper [0.35, 0.15]": 0.4}  # fmt: skip
     rows = [{"certificate": name, "worst_margin": worst, **row} for name, worst in names.items()]
     finding = claims.parameters_feasible(
-        "SafeMR", evidence(score_rows(), certificates=pd.DataFrame(rows))
+        "SafeMR", evidence(score_rows(), certificates=pd.DataFrame([*rows, elsewhere]))
     )
     assert finding.verdict == "confirmed"
     assert finding.estimate.mean == -0.1
@@ -165,7 +167,8 @@ def test_aircraft_claims(scores, volumes, missed, expected):
     [(0.02, 1.0, "refuted"), (-0.01, 1.0, "confirmed"), (-0.01, -1.0, "inconclusive")],
 )
 def test_one_state_without_a_safe_action_refutes_feasibility(scores, worst, aligned, expected):
-    row = {"certificate": "paper [0.35, 0.15]", "worst_margin": worst, "infeasible_share": 0.0,
+    row = {"task": TASK, "certificate": "paper [0.35, 0.15]",
+           "worst_margin": worst, "infeasible_share": 0.0,
            "margin_inside_aligned": aligned, "margin_outside_aligned": aligned,
            "margin_inside_drag": -1.0, "margin_outside_drag": -1.0}  # fmt: skip
     given = evidence(scores, certificates=pd.DataFrame([row]))
@@ -228,6 +231,58 @@ def test_a_claims_table_without_any_run_is_complete_and_inconclusive():
     table = claims.claims_table(nothing)
     assert set(table.data["verdict"]) == {"inconclusive"}
     assert table.data["reason"].str.startswith("runs missing: ").all()
+
+
+def test_a_grid_without_a_task_of_the_paper_gets_no_verdict(scores):
+    """Whatever its runs are called by themselves, they are of other tasks."""
+    elsewhere = with_baselines(scores[scores["task"] == TASK]).assign(task="Pillars-8")
+    row = {"task": "Pillars-8", "certificate": "SafeMR (seed 0)", "worst_margin": 0.5,
+           "infeasible_share": 0.1, "margin_inside_aligned": 1.0, "margin_outside_aligned": 1.0,
+           "margin_inside_drag": 1.0, "margin_outside_drag": 1.0}  # fmt: skip
+    given = evidence(
+        elsewhere,
+        tasks=reference.TASKS,
+        expected=elsewhere[["task", "variant", "seed"]].drop_duplicates(),
+        certificates=pd.DataFrame([row]),
+    )
+    table = claims.claims_table(given)
+    assert set(table.data["verdict"]) == {"not run"}
+    assert table.data["reason"].str.startswith("not in this configuration: ").all()
+    assert table.data["estimate"].isna().all()
+
+
+def test_a_grid_with_one_task_of_the_paper_is_judged_on_it(scores):
+    ours = with_baselines(scores[scores["task"] == TASK])
+    given = evidence(ours, tasks=reference.TASKS, expected=ours[["task", "variant", "seed"]])
+    table = claims.claims_table(given).data.set_index("claim")["verdict"]
+    assert table[f"highest_return[{TASK}]"] == "confirmed"
+    assert table[f"highest_return[{OTHER}]"] == "not run"
+    assert table["zero_violations"] == "inconclusive", "three of its tasks are missing"
+    assert table["conservativeness"] == table["sensitivity_cost"] == "not run"
+
+
+def test_two_seeds_confirm_nothing(scores):
+    two = with_baselines(scores[(scores["seed"] < 2) & (scores["task"] == TASK)])
+    verdicts = claims.claims_table(evidence(two)).data.set_index("claim")["verdict"]
+    assert "confirmed" not in set(verdicts)
+    assert verdicts["zero_violations"] == verdicts["unsafe[CPO]"] == "inconclusive"
+    assert verdicts["safe_but_lower[JointSIS]"] == "inconclusive"
+    unsafe = two["variant"].isin([*reference.BASELINES]) & (two["metric"] == "eval_cost_indicator")
+    two.loc[unsafe, "value"] = 9.0
+    assert verdict(f"highest_return[{TASK}]", evidence(two)) == "inconclusive"
+    one = (two["variant"] == "SafeMR") & (two["metric"] == "eval_zero_violation_share")
+    two.loc[one & (two["seed"] == 0), "value"] = 0.9
+    assert verdict("zero_violations", evidence(two)) == "refuted", "one violation is enough"
+
+
+def test_intervals_in_the_reasons_keep_the_bounds_of_what_they_are_of(scores):
+    clean = (scores["variant"] == "SafeMR") & (scores["metric"] == "eval_zero_violation_share")
+    scores.loc[clean & (scores["seed"] == 0), "value"] = 0.9
+    finding = claims.zero_violations(evidence(scores))
+    assert finding.estimate.high == 1.0
+    cost = (scores["variant"] == "CPO") & (scores["metric"] == "eval_cost_indicator")
+    scores.loc[cost & (scores["seed"] > 0), "value"] = 0.0
+    assert claims.unsafe_everywhere("CPO", evidence(scores)).estimate.low == 0.0
 
 
 def test_every_claim_has_its_rule_in_the_documentation():

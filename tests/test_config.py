@@ -24,8 +24,8 @@ DEFAULT = ROOT / "config/config.yaml"
 VALID: dict[str, Any] = {
     "tasks": ["Pillars-0.15-Goal", "Hazards-0.15-Push"],
     "algorithms": {
-        "SafeMR": {"algorithm": "safemr", "a": 0.35, "b": 0.15},
-        "PPO-L": {"algorithm": "ppo_lagrangian"},
+        "SafeMR": {"algorithm": "safemr", "a": 0.35, "b": 0.15, "start_steps": 100},
+        "PPO-L": {"algorithm": "ppo_lagrangian", "epoch_steps": 800},
     },
     "seeds": [100, 101],
     "budget": {"off_policy": 1000, "on_policy": 2000},
@@ -45,7 +45,12 @@ VALID: dict[str, Any] = {
         "points": [[0.35, 0.15], [0.45, 0.15]],
         "seeds": [100],
     },
-    "aircraft": {"algorithms": {"JointSIS": {"algorithm": "joint_sis"}}, "seeds": [100]},
+    "aircraft": {
+        "algorithms": {
+            "JointSIS": {"algorithm": "joint_sis", "start_steps": 100, "target_entropy": -1.0}
+        },
+        "seeds": [100],
+    },
     "outside": {"Script": {"algorithm": "script", "steps": 100, "hyperparameters": {"gain": 1.0}}},
     "results_root": "results",
     "figures_root": "paper_figures",
@@ -74,18 +79,39 @@ NOT_A_NAME = [
 ]
 NOT_A_LIST = [None, 3, "100", {}, {"a": 1}, [], True]
 NOT_A_ROOT = [
-    *(None, 3, [], "", ".", "..", "../up", "a/../b", "/absolute", ".git", "~/home", "a//b", "a b"),
+    *(None, 3, [], "", ".", "..", "../..", "a/../b", "a/..", "/", ".git", "../.git", "a//b", "a b"),
+    *("safemr", "workflow/x", "tests", "examples/x", "a/./b", "C:\\x", "{wildcard}", "résultats"),
+    *("$HOME", "~/home", "a\0b", "//x", "/..", "/../x"),
+    *(str(ROOT), str(ROOT.parent), str(ROOT / "safemr"), str(ROOT / "tests/x"), str(ROOT / ".git")),
+    str(ROOT / "README.md"),
+]
+
+# Each value is of its type; with the task (two actions, episodes of 1,000 steps) and the budget
+# (1,000 steps) it can only end in absurd numbers or in nothing learned.
+HOPELESS: list[dict[str, Any]] = [
+    *({"target_entropy": value} for value in [2 * math.log(2), 1.4, 2.0, 1e9]),
     *(
-        "safemr",
-        "workflow/x",
-        "tests",
-        "a/./b",
-        "C:\\x",
-        "{wildcard}",
-        "résultats",
-        "$HOME",
-        "a\0b",
+        {name: value}
+        for name in ["critic_lr", "policy_lr", "temperature_lr"]
+        for value in [2, 1e25]
     ),
+    *({"gamma": 1.0}, {"polyak": 1.5}, {"polyak": 0.0}, {"initial_log_temperature": 80.0}),
+    *({"constraint_scale": value} for value in [1e-30, 1e30]),
+    *({"multiplier_cap": 1e30}, {"sigma": 1e9}, {"n": 200.0}, {"k": 1e9}, {"length_scale": 1e-9}),
+    *({"hidden": 10**9}, {"num_envs": 10**6}, {"replay_capacity": 10**10}, {"a": 1e30}),
+    *({"batch_size": 1_000, "replay_capacity": 500}, {"n_step": 1_001, "start_steps": 0}),
+    *({"start_steps": value} for value in [999, 1_000, 5_000]),
+    *({"update_every": 900}, {"updates_together": 500}, {"certificate_delay": 113}),
+    {"policy_delay": 200, "multiplier_delay": 200},
+]
+HOPELESS_EPOCHS: list[dict[str, Any]] = [
+    *({"epoch_steps": 2_008}, {"target_kl": 1e6}, {"gamma": 1.0}, {"cost_gamma": 1.0}),
+    *(
+        {"epoch_steps": 800, name: 2.0}
+        for name in ["value_lr", "policy_lr", "multiplier_lr", "clip"]
+    ),
+    *({"epoch_steps": 800, "initial_log_std": value} for value in [-100.0, 50.0]),
+    {"epoch_steps": 800, "multiplier_initial": 1e12},
 ]
 
 WRONG: dict[tuple[str, ...], list[Any]] = {
@@ -107,13 +133,18 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
         {"X": {"algoritm": "fac"}},
         *({"X": {"algorithm": name}} for name in [*NOT_A_NAME, "FAC", "safe_mr", "os", "__init__"]),
         {"A": {"algorithm": "fac"}, "a": {"algorithm": "joint_sis"}},
-        {"A": {"algorithm": "fac"}, "B": {"algorithm": "fac", "n": 2.0}},
+        {
+            "A": {"algorithm": "fac", "start_steps": 100},
+            "B": {"algorithm": "fac", "n": 2.0, "start_steps": 100},
+        },
     ],
     ("algorithms", "SafeMR"): [
         *({"algorithm": "safemr", "gamma": value} for value in [*NOT_A_NUMBER, math.inf, 2, -0.1]),
         *({"algorithm": "safemr", "batch_size": value} for value in NOT_POSITIVE[:-1]),
         *({"algorithm": "safemr", "activation": value} for value in [3, "Elu", None, ["elu"]]),
         *({"algorithm": "safemr", key: 1} for key in ["gama", "Sigma", "lr", "__class__"]),
+        *({"algorithm": "safemr", "start_steps": 100, **values} for values in HOPELESS),
+        *({"algorithm": "ppo_lagrangian", **values} for values in HOPELESS_EPOCHS),
     ],
     ("budget",): [None, {}, {"off_policy": 1000}, *NOT_A_MAPPING, {"offpolicy": 1000}],
     ("budget", "off_policy"): [*NOT_POSITIVE, 5],
@@ -269,6 +300,16 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
         (("tasks",), ["Pillars-0.15-Gaol"], "did you mean 'Pillars-0.15-Goal'?"),
         (("algorithms", "X"), {"algorithm": "safmr"}, "did you mean 'safemr'?"),
         (("algorithms", "X"), {"algorithm": "fac", "gama": 0.9}, "did you mean 'gamma'?"),
+        (("algorithms", "X"), {"algorithm": "ppo"}, "did you mean 'ppo_lagrangian'?"),
+        (("algorithms", "X"), {"algorithm": "PPO-L"}, "did you mean 'ppo_lagrangian'?"),
+        (("algorithms", "X"), {"algorithm": "ppo-l"}, "did you mean 'ppo_lagrangian'?"),
+        (("algorithms", "X"), {"algorithm": "trpo"}, "did you mean 'trpo_lagrangian'?"),
+        (("algorithms", "X"), {"algorithm": "sac"}, "did you mean 'sac_lagrangian'?"),
+        (("algorithms", "X"), {"algorithm": "jointsis"}, "did you mean 'joint_sis'?"),
+        (("algorithms", "X"), {"algorithm": "FAC-phih"}, "did you mean 'fac'?"),
+        (("algorithms", "X"), {"algorithm": "cop"}, "did you mean 'cpo'?"),
+        (("tasks",), ["Pillars"], "did you mean 'Pillars-0.15-Goal' or 'Pillars-0.30-Goal'?"),
+        (("tasks",), ["Pillars-0.15-Goal-v0"], "did you mean 'Pillars-0.15-Goal'?"),
         (("sensitivity", "algorithm"), "SafeMT", "did you mean 'SafeMR'?"),
         (("wandb", "mode"), "ofline", "did you mean 'offline'?"),
         (("task_overrides", "Hazards-0.15-Push", "settings"), {"slep": True}, "'slep'"),
@@ -280,6 +321,41 @@ def test_misspelt_names_are_named_with_the_nearest(
     with pytest.raises(UserError) as caught:
         resolve(changed(path, value))
     assert expected in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name", "value", "reason"),
+    [
+        # The value is the default: what is refused is to set it.
+        ("sac_lagrangian", "sigma", 0.3, "there is no energy function"),
+        ("sac_lagrangian", "constraint_floor", -0.001, "there is no energy function"),
+        ("cpo", "policy_lr", 3e-4, "a hyperparameter of fac, joint_sis, neural_safemr, ppo_lagran"),
+        ("fac", "certificate_travel", 0.33, "a hyperparameter of joint_sis, safemr"),
+        ("joint_sis", "a", 0.35, "a hyperparameter of neural_safemr, safemr"),
+    ],
+)
+def test_what_an_algorithm_does_not_use_is_refused_by_name(
+    algorithm: str, name: str, value: float, reason: str
+) -> None:
+    with pytest.raises(UserError) as caught:
+        resolve(changed(("algorithms", "X"), {"algorithm": algorithm, name: value}))
+    text = one_line(caught.value)
+    assert f"algorithms.X: {algorithm} does not use {name}" in text
+    assert reason in text
+
+
+def test_tuning_a_family_to_a_task_skips_whom_it_does_not_concern() -> None:
+    """SAC-Lagrangian has no energy, so the unit of its lengths does not stop it."""
+    raw = changed(
+        ("aircraft", "algorithms", "SAC-L"),
+        {"algorithm": "sac_lagrangian", "start_steps": 100, "target_entropy": -1.0},
+    )
+    raw["task_overrides"]["Aircraft"] = {"hyperparameters": {"off_policy": {"length_scale": 5.0}}}
+    lengths = {
+        run.variant: run.config["algorithm"]["hyperparameters"]["length_scale"]
+        for run in resolve(raw).aircraft
+    }
+    assert lengths == {"JointSIS": 5.0, "SAC-L": 1.0}
 
 
 anything = st.recursive(
@@ -300,6 +376,25 @@ def test_random_values_end_in_a_plan_or_one_line(path: tuple[str, ...], value: A
         one_line(error)
     else:
         assert all(".." not in run.path.parts and not run.path.is_absolute() for run in plan.runs)
+
+
+def test_roots_may_lie_outside_the_repository(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    before = [run.path for run in resolve(VALID).runs]
+    for key in ("results_root", "figures_root"):
+        for root in ("../up", "../../up/a.b", f"{tmp_path}/away", "/data/safemr", "x/y"):
+            parsed = config.parse(changed((key,), root))
+            assert getattr(parsed, key) == Path(root)
+            assert [run.path for run in runs.resolve(parsed).runs] == before
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match="is a file"):
+        config.parse(changed(("results_root",), "../file"))
+    monkeypatch.chdir(ROOT / "docs")  # the same words from another folder
+    with pytest.raises(UserError, match="among the sources"):
+        config.parse(changed(("results_root",), "../safemr/x"))
 
 
 def test_the_grid() -> None:

@@ -62,16 +62,27 @@ def test_controllers_drive_at_the_velocity_they_want():
 
 
 def test_scores_enter_the_tables_like_any_other_variant(tmp_path):
-    short = {GOAL: {"max_episode_steps": 20}, PUSH: {"max_episode_steps": 20}}
-    scores = controllers.controller_scores((GOAL, PUSH), seeds=(0, 1), episodes=2, settings=short)
+    # What a task is called says nothing of what can act in it.
+    short = [
+        {"name": name, "base": base, "settings": {"max_episode_steps": 20}}
+        for name, base in (("Doors-Reach", GOAL), ("Crates", PUSH))
+    ]
+    scores = controllers.controller_scores(short, seeds=(0, 1), episodes=2)
+    assert set(scores["task"]) == {"Doors-Reach", "Crates"}
+    assert set(scores.loc[scores["metric"] == "eval_length", "value"]) == {20.0}
     assert set(scores["variant"]) == {
         "scripted: ignores obstacles", "scripted: touches the box", "scripted: pushes the box"
     }  # fmt: skip
     display = tables.full_results(scores).display
     assert set(display["seeds"]) == {"2"}
     assert not display.isin([tables.MISSING]).any().any()
-    again = controllers.controller_scores((GOAL, PUSH), seeds=(0, 1), episodes=2, settings=short)
+    again = controllers.controller_scores(short, seeds=(0, 1), episodes=2)
     assert scores.equals(again)
+
+
+def test_safety_gyms_own_task_has_its_reference_line():
+    (name,) = set(controllers.controller_scores(["PointGoal1"], seeds=(0,), episodes=1)["variant"])
+    assert name == "scripted: ignores obstacles"
 
 
 def test_a_task_of_another_kind_has_no_reference_line():

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import csv
+import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
-from safemr import inspection, train
+from safemr import inspection, train, training
 
+ROOT = Path(__file__).resolve().parents[1]
 TASK, SHORT = "Hazards-0.15-Push", ("task.max_episode_steps=50", "hidden=16")
 DIVERGING = {
-    "fac": ("critic_lr=1e25", "start_steps=100", "batch_size=32"),
-    "safemr": ("policy_lr=1e30", "start_steps=100", "batch_size=32"),
-    "ppo_lagrangian": ("value_lr=1e30", "epoch_steps=320"),
+    # An entropy that is hardly reached: the temperature, and with it every loss, grows for ever.
+    "fac": ("target_entropy=1.386", "temperature_lr=1", "start_steps=100", "batch_size=32"),
+    "safemr": ("target_entropy=1.386", "temperature_lr=1", "start_steps=100", "batch_size=32"),
+    # Steps of 1 for a policy whose actions hardly vary.
+    "ppo_lagrangian": ("policy_lr=1", "initial_log_std=-10", "epoch_steps=320"),
 }
+RECORDED = [path for path in ROOT.glob("results/**/progress.csv") if "probes" not in path.parts]
 
 
 @pytest.mark.parametrize("name", DIVERGING)
@@ -29,7 +37,7 @@ def test_a_diverging_run_ends_in_one_line_and_is_named(
         lines.append(capsys.readouterr().err.splitlines()[-1])
     assert lines[0] == lines[1]
     assert re.fullmatch(
-        rf"error: {name} {TASK} seed 100: (\w+) became (nan|-?inf) at step \d+; "
+        rf"error: {name} {TASK} seed 100: (\w+) became \d{{9,}}\.\d at step \d+; "
         r"last good log point: step \d+; no checkpoint yet",
         lines[0],
     )
@@ -38,3 +46,32 @@ def test_a_diverging_run_ends_in_one_line_and_is_named(
     printed = capsys.readouterr().out
     assert f"{name} {TASK} seed 100" in printed
     assert "failed: " in printed
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e9, -1e9])
+def test_what_is_absurdly_large_counts_as_infinite(value: float) -> None:
+    with pytest.raises(training.TrainingDivergedError) as caught:
+        training.check_finite(7, {"updates": 1e9, "policy_loss": 1.0, "temperature": value})
+    error = caught.value
+    assert (error.step, error.quantity) == (7, "temperature")
+    assert error.value == value or (math.isnan(error.value) and math.isnan(value))
+    parameters = torch.tensor([0.5, value, -2.0])
+    with pytest.raises(training.TrainingDivergedError, match="policy_parameters became"):
+        training.check_parameters(7, parameters)
+
+
+def test_the_bounds_are_far_from_every_recorded_run() -> None:
+    """A thousand times the largest number of the records passes."""
+    assert len(RECORDED) > 300
+    largest: dict[str, float] = {}
+    for path in RECORDED:
+        with path.open() as lines:
+            for row in csv.DictReader(lines):
+                for name, text in row.items():
+                    if text and not name.startswith(("time_", "step", "train_", "eval_")):
+                        largest[name] = max(largest.get(name, 0.0), abs(float(text)))
+    assert largest["cost_grad_norm"] > 100
+    training.check_finite(0, {name: 1_000 * value for name, value in largest.items()})
+    for path in ROOT.glob("results/**/policy.npz"):
+        with np.load(path) as arrays:
+            training.check_parameters(0, 1_000 * torch.from_numpy(arrays["policy_parameters"]))

@@ -91,6 +91,31 @@ def test_damaged_arrays_are_named(kept: Measurements) -> None:
         kept.arrays("margins", "one", {}, dict)
 
 
+def test_what_is_only_unreadable_is_not_advised_to_be_deleted(kept: Measurements) -> None:
+    """A folder in a file's place stands for a permission that is missing, too (root reads all)."""
+    kept.rows(KIND, "one", {}, lambda: [1])
+    kept.arrays("margins", "one", {}, lambda: {"x": np.zeros(3)})
+    for kind, read in (
+        (KIND, lambda: kept.rows(KIND, "one", {}, list)),
+        ("margins", lambda: kept.arrays("margins", "one", {}, dict)),
+    ):
+        (path,) = (kept.folder / kind).iterdir()
+        path.unlink()
+        path.mkdir()
+        with pytest.raises(UserError, match="cannot be read: Is a directory") as caught:
+            read()
+        assert "delete" not in str(caught.value)
+
+
+def test_somebodys_own_file_beside_the_measurements_stays(kept: Measurements) -> None:
+    kept.rows(KIND, "one", {"seed": 1}, lambda: 1)
+    own = kept.folder / KIND / "one-my_own_copy_.json"  # as long as a name of ours
+    own.write_text("{}")
+    kept.rows(KIND, "one", {"seed": 2}, lambda: 2)
+    assert own.exists()
+    assert len(list(own.parent.iterdir())) == 2
+
+
 def test_a_failed_measurement_keeps_nothing(kept: Measurements) -> None:
     def fails() -> None:
         raise UserError("no")

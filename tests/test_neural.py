@@ -17,6 +17,7 @@ from envs.aircraft import AircraftVectorEnv, observe
 from safemr import aircraft, energy, neural_evidence, records, runs
 from safemr.algorithms import neural_safemr
 from safemr.buffers import Batch
+from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.plotting import aircraft as pictures
 from safemr.policies import Policy
@@ -233,7 +234,7 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
         assert learners.loc[seed, "volume_ratio"] == expected.volume_ratio
         assert learners.loc[seed, "leak_share"] == expected.leak_share
     fitted = rows[rows["variant"] == f"{neural_evidence.CONTROL}, shifted"].iloc[0]
-    assert fitted["missed_share"] <= aircraft.COVERS
+    assert fitted["missed_share"] <= COVERS
     curve = rows[rows["kind"] == "control"]
     assert curve["volume_ratio"].is_monotonic_decreasing
     assert (curve["missed_share"] <= np.array(neural_evidence.CONTROL_SHARES)).all()
@@ -253,7 +254,7 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
     x, y, cut = neural_evidence.slice_at(solution, found, spacing=0.5)
     inside = np.hypot(*np.meshgrid(x, y, indexing="ij")) < CONSTANT.d_min
     assert all((claimed[inside] > 0).all() for claimed in cut.learned["Neural-a1"])
-    figure = pictures.neural(x, y, cut, CONSTANT.d_min, FRONTIER, rows, aircraft.COVERS)
+    figure = pictures.neural(x, y, cut, CONSTANT.d_min, FRONTIER, rows, COVERS)
     left, right = figure.axes
     dashed = [line for line in left.lines if line.get_linestyle() == "--"]
     np.testing.assert_allclose(dashed[0].get_ydata(), curve["volume_ratio"])

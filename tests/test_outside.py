@@ -9,10 +9,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
-from safemr import records
+from safemr import records, statistics, tables
 from safemr.config import load
+from safemr.plotting import curves
 from safemr.runs import resolve
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,12 +31,12 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
             "hyperparameters": {"population": 4, "elites": 2},
         }
     }
-    short = {"Pillars-0.15-Goal": {"settings": {"max_episode_steps": 50}}}
+    short = {"base": "Pillars-0.15-Goal", "settings": {"max_episode_steps": 50}}
     config = load(
         [ROOT / "config/smoke.yaml"],
-        {"outside": outside, "task_overrides": short, "tasks": ["Pillars-0.15-Goal"]},
+        {"outside": outside, "tasks": ["Pillars-0.15-Goal", {"Short": short}]},
     )
-    run = resolve(config).outside[0]
+    (run,) = [run for run in resolve(config).outside if run.task == "Short"][:1]
     root = tmp_path_factory.mktemp("results")
     command = [
         sys.executable, str(PROGRAM), "--config", run.resolved, "--variant", run.variant,
@@ -53,7 +55,7 @@ def test_record_is_accepted_and_read_like_any_other(record):
     records.verify_record(root / folder)
     index, progress = records.read_records(root)
     assert index[["task", "variant", "seed", "algorithm", "steps"]].iloc[0].tolist() == [
-        "Pillars-0.15-Goal",
+        "Short",
         "CEM",
         100,
         "cross_entropy",
@@ -128,3 +130,71 @@ def test_unknown_hyperparameter_is_named(tmp_path, record):
     assert done.returncode == 2
     assert "popluation" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def silent(root: Path, seed: int, origin: dict[str, object]) -> None:
+    """A record of another seed of which the provenance says no more than ``origin``."""
+    config = {
+        "schema": 1, "task": {"name": "Pillars-0.15-Goal", "version": 1, "settings": {}},
+        "algorithm": {"name": "cross_entropy", "version": 1, "hyperparameters": {}},
+        "seed": seed, "steps": 400, "log_every": 10,
+        "evaluation": {"every": 10, "episodes": 2, "seed": 10000},
+    }  # fmt: skip
+    row = {"step": 400, "time_wall_s": 30.0, "eval_return": 1.0, "eval_cost": 0.0,
+           "eval_zero_violation_share": 1.0}  # fmt: skip
+    folder = root / records.record_path(config, "CEM")
+    records.write_record(folder, config, "CEM", [row], origin)
+
+
+def computed(root: Path) -> tuple[tables.Table, pd.DataFrame]:
+    """The table of compute and the clock of the curves, through the files that the rules write."""
+    runs, progress = records.read_records(root)
+    stored = root / "runs.csv"
+    runs.to_csv(stored, index=False)
+    assert (runs["cpu_s"] / 60).dtype == float, "what scripts/aggregate.py computes"
+    again = pd.read_csv(stored)
+    minutes = statistics.core_minutes(progress, again)
+    returns = statistics.learning_curves(progress, "eval_return")
+    curves.compute_curves(returns, minutes, ["Pillars-0.15-Goal"])
+    table = tables.compute(again)
+    pd.testing.assert_frame_equal(tables.compute(runs).display, table.display)
+    return table, minutes
+
+
+def test_a_record_that_does_not_say_what_it_cost_has_dashes(record):
+    """The example's provenance says neither processor time nor memory nor processor."""
+    root, _ = record
+    table, minutes = computed(root)
+    (row,) = table.display.to_dict("records")
+    assert (row["core-minutes a run"], row["steps a core-second"], row["peak MB"]) == ("–",) * 3
+    assert "0.0 core-hours" in table.caption
+    assert "no record names its processor" in table.caption
+    assert table.notes == [
+        "Records that do not say their processor time: CEM on Pillars-0.15-Goal (1 of 1)."
+    ]
+    for text in (table.markdown(), table.latex()):
+        assert "inf" not in text
+        assert "nan" not in text
+    assert minutes.empty
+
+
+def test_means_are_over_the_records_that_say_what_they_cost(tmp_path):
+    silent(tmp_path, 0, {})
+    silent(tmp_path, 1, {"wall_s": 60.0, "cpu_s": 120.0, "peak_rss_mb": 100, "cpu": "a processor"})
+    silent(tmp_path, 2, {"wall_s": 0, "cpu_s": 0.0, "peak_rss_mb": None, "cpu": None})
+    table, minutes = computed(tmp_path)
+    (row,) = table.data.to_dict("records")
+    assert (row["runs"], row["core_minutes"], row["steps_per_core_s"]) == (3, 2.0, 400 / 120)
+    assert row["peak_mb"] == 100.0
+    assert "(a processor)" in table.caption
+    assert "(2 of 3)" in table.notes[0]
+    assert minutes["minutes"].tolist() == [1.0]  # half a minute of wall time on two processors
+
+
+@pytest.mark.parametrize(
+    "origin", [{"cpu_s": "12"}, {"wall_s": -1.0}, {"peak_rss_mb": True}, {"cpu": 7}]
+)
+def test_a_provenance_of_another_type_is_refused(tmp_path, origin):
+    silent(tmp_path, 0, origin)
+    with pytest.raises(records.RecordError, match=next(iter(origin))):
+        records.read_records(tmp_path)

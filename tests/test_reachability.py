@@ -204,6 +204,11 @@ def test_cached_solution_is_the_solution(tmp_path: Path):
         path.write_bytes(b"damaged")
     with pytest.raises(UserError, match="delete it"):
         load_or_solve(tmp_path, CONSTANT, grid, 0.5)
+    for path in kept:
+        path.unlink()
+        path.mkdir()
+    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+        load_or_solve(tmp_path, CONSTANT, grid, 0.5)
 
 
 def reference_arrays() -> dict[str, np.ndarray]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_record import CONFIG, POLICY, make_record
 
-from safemr import inspection, records
+from safemr import certify, evaluate, inspection, records
 from safemr.checkpoints import RunSession
 from safemr.records import RecordError
 
@@ -71,7 +73,7 @@ def test_a_written_record_is_verified_and_read(record: Path, tmp_path: Path) -> 
     assert list(progress) == ["task", "variant", "seed", "step", "metric", "value"]
     assert len(progress) == 6
     np.testing.assert_array_equal(
-        records.load_policy(record / "policy.npz")["weights"], POLICY["weights"]
+        records.policy_arrays(record / "policy.npz")["weights"], POLICY["weights"]
     )
 
 
@@ -162,8 +164,71 @@ def test_a_damaged_record_is_refused_with_path_and_repair(
         message = str(caught.value)
         assert expected in message
         assert str(record) in message
-        assert f"rm -r '{record}' && snakemake" in message
+        assert f"rm -r {shlex.quote(str(record))} && snakemake" in message
         assert "\n" not in message
+
+
+def foreign_folders(root: Path, record: Path) -> dict[str, Path]:
+    """Folders that are not a record's place, whatever they hold."""
+    copied = root / "backup" / record.name  # a whole record, but somewhere else
+    shutil.copytree(record, copied)
+    shallow = root / "runs" / "Pillars-0.15-Goal"
+    named = root / "results" / "seed0-0123456789ab"
+    thesis = root / "thesis"
+    for folder in (named, thesis):
+        folder.mkdir(parents=True)
+        (folder / "chapter1.tex").write_text("years of work")
+    (root / "empty").mkdir()
+    return {"a person's": thesis, "named like one": named, "above one": shallow, "a copy": copied,
+            "empty": root / "empty", "absent": root / "nowhere",
+            "a file": record / "policy.npz"}  # fmt: skip
+
+
+def test_nothing_but_a_record_is_ever_advised_to_be_removed(record: Path, tmp_path: Path) -> None:
+    for kind, folder in foreign_folders(tmp_path, record).items():
+        for read in (
+            records.verify_record,
+            evaluate.evaluate_record,
+            certify.certificate_of_record,
+        ):
+            with pytest.raises(RecordError) as caught:
+                read(folder)
+            message = str(caught.value)
+            assert "rm " not in message, kind
+            assert "remove" not in message, kind
+            assert "<results root>/runs/<task>/<variant>/seed<n>-<digest>" in message, kind
+            assert str(folder) in message
+            assert "\n" not in message
+    with pytest.raises(RecordError, match=r"it holds chapter1\.tex; a record is"):
+        records.verify_record(tmp_path / "thesis")
+    with pytest.raises(RecordError, match="no folder"):
+        records.verify_record(tmp_path / "nowhere")
+
+
+def test_a_record_beside_what_is_somebodys_own(record: Path) -> None:
+    (record / "config.json").unlink()
+    (record / "my notes.txt").write_text("why this run is the best")
+    with pytest.raises(RecordError, match=r"my notes\.txt, which is no part of a record") as caught:
+        records.verify_record(record)
+    assert "rm " not in str(caught.value)
+
+
+def test_the_advice_can_be_pasted_whatever_the_path(tmp_path: Path) -> None:
+    folder = make_record(tmp_path / "a person's $(echo) folder")
+    (folder / "config.json").unlink()
+    with pytest.raises(RecordError) as caught:
+        records.verify_record(folder)
+    command = str(caught.value).partition("repair: ")[2].removesuffix(" && snakemake -j2")
+    assert shlex.split(command) == ["rm", "-r", str(folder)]
+    subprocess.run(command, shell=True, check=True)
+    assert not folder.exists()
+    assert folder.parent.exists()
+
+
+def test_a_record_that_is_gone_needs_no_removal(record: Path) -> None:
+    shutil.rmtree(record)
+    with pytest.raises(RecordError, match=r"config\.json is missing; repair: snakemake -j2"):
+        records.verify_record(record)
 
 
 def test_a_record_in_the_wrong_place_is_refused(record: Path, tmp_path: Path) -> None:

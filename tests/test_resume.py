@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import random
 import shutil
 import signal
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from kills import Outcome, attempt, equal_rows, finish, killed, make_run, outcome, short_run
 
-from safemr import records, runs
-from safemr.checkpoints import RunSession
-from safemr.train import train
+from safemr import runs
 
 # Overrides that let every branch of an algorithm run within 600 steps.
 SMALL: dict[str, dict[str, Any]] = {
@@ -25,56 +21,17 @@ SMALL: dict[str, dict[str, Any]] = {
     "on_policy": {"epoch_steps": 320, "hidden": 16, "value_batch": 80, "policy_batch": 80},
 }
 
-SETTINGS = {"Hazards-0.15-Push": {"max_episode_steps": 50}}
-
 
 def small_run(name: str, steps: int = 1200, task: str = "Hazards-0.15-Push") -> runs.Run:
     algorithm = runs.load_algorithm(name)
     fields = algorithm.hyperparameters.__dataclass_fields__
     overrides = {k: v for k, v in SMALL[algorithm.family].items() if k in fields}
-    return runs.make_run(
-        runs.describe_task(task, SETTINGS.get(task, {})),
-        algorithm,
-        runs.hyperparameters(algorithm, overrides, name),
-        variant=name,
-        seed=100,
-        steps=steps,
-        log_every=steps // 12,
-        evaluation={"every": steps // 4, "episodes": 1, "seed": 10_000},
-    )
+    return make_run(name, task, overrides, steps, points=12, evaluations=4)
 
 
-def attempt(run: runs.Run, root: Path) -> int:
-    """Train in a forked process, which need not import anything; returns its process id."""
-    pid = os.fork()
-    if pid:
-        return pid
-    status = 1
-    try:
-        with open(os.devnull, "w") as quiet:
-            sys.stderr = quiet
-            with RunSession(run.config, run.variant, root, minimum_interval=0.0) as session:
-                if not session.complete:
-                    train(run.config, session, stream=quiet)
-            status = 0
-    finally:
-        os._exit(status)
-
-
-def outcome(run: runs.Run, root: Path) -> tuple[list[dict[str, str]], bytes]:
-    """Progress without the time columns, and the policy file."""
-    folder = root / run.path
-    records.verify_record(folder)
-    rows = list(csv.DictReader(io.StringIO((folder / "progress.csv").read_text())))
-    kept = [{k: v for k, v in row.items() if not k.startswith("time_")} for row in rows]
-    return kept, (folder / "policy.npz").read_bytes()
-
-
-def uninterrupted(run: runs.Run, root: Path) -> tuple[tuple[list[dict[str, str]], bytes], float]:
+def uninterrupted(run: runs.Run, root: Path) -> tuple[Outcome, float]:
     begun = time.monotonic()
-    _, status = os.waitpid(attempt(run, root), 0)
-    assert status == 0
-    return outcome(run, root), time.monotonic() - begun
+    return finish(run, root), time.monotonic() - begun
 
 
 def interrupted(run: runs.Run, root: Path, duration: float, kills: int, seed: int) -> None:
@@ -92,6 +49,17 @@ def interrupted(run: runs.Run, root: Path, duration: float, kills: int, seed: in
             window *= 0.7
     _, status = os.waitpid(attempt(run, root), 0)
     assert status == 0
+
+
+@pytest.mark.parametrize("name", ["safemr", "ppo_lagrangian"])
+def test_kills_after_known_checkpoints(name: str, tmp_path: Path) -> None:
+    """With the default networks, and every attempt but the first begun from a checkpoint."""
+    run = short_run(name)
+    every = run.config["log_every"]
+    whole = finish(run, tmp_path / "whole")
+    again = killed(run, tmp_path / "killed", [2 * every, 7 * every], [0.0, 0.05])
+    assert equal_rows(again, whole) == len(whole[0])
+    assert again == whole
 
 
 @pytest.mark.parametrize("name", ["safemr", "ppo_lagrangian"])
@@ -114,6 +82,31 @@ def test_many_kills_of_every_algorithm(task: str, name: str, tmp_path: Path) -> 
         root = tmp_path / f"killed{seed}"
         interrupted(run, root, duration, kills=5, seed=seed)
         assert outcome(run, root) == whole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "name", "overrides"),
+    [
+        *(("Pillars-0.15-Goal", name, {}) for name in runs.algorithm_names()),
+        ("Hazards-0.30-Push", "safemr", {}),
+        ("Pillars-0.15-Goal", "safemr", {"backend": "torch"}),
+        ("Aircraft", "safemr", {}),
+        ("Aircraft", "ppo_lagrangian", {}),
+    ],
+)
+def test_many_kills_after_known_checkpoints(
+    task: str, name: str, overrides: dict[str, Any], tmp_path: Path
+) -> None:
+    """`tests/kills.py` counts more of them."""
+    run = short_run(name, task, overrides)
+    every = run.config["log_every"]
+    whole = finish(run, tmp_path / "whole")
+    for number, points in enumerate([(1, 5, 9), (2, 3, 4), (7, 8, 10)]):
+        root = tmp_path / f"killed{number}"
+        again = killed(run, root, [point * every for point in points], [0.0, 0.02, 0.05])
+        assert equal_rows(again, whole) == len(whole[0])
+        assert again == whole
 
 
 def test_two_runs_with_one_seed_are_equal(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from safemr.policies import Policy, network_arrays
 from safemr.reference import PHI_H
 
 TASK = "Pillars-0.15-Goal"
-LAYOUT = {"max_episode_steps": 60}
+LAYOUT = {"name": "Short", "base": TASK, "settings": {"max_episode_steps": 60}}
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +34,8 @@ def policy() -> Policy:
 
 
 def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
-    recorded = rollouts.episodes(policy, TASK, seeds=[5, 6, 7], steps=60, settings=LAYOUT)
-    envs = make_simulator(TASK, 3, LAYOUT)
+    recorded = rollouts.episodes(policy, LAYOUT, seeds=[5, 6, 7], steps=60)
+    envs = make_simulator(LAYOUT, 3)
     scores = evaluate(policy, envs, seed=5)
     envs.close()
     assert recorded["reward"].sum(0).mean() == pytest.approx(scores["return"], abs=1e-5)
@@ -50,7 +50,21 @@ def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
 
 def test_no_more_steps_than_an_episode_has(policy):
     with pytest.raises(UserError, match="60 steps, 61 were asked"):
-        rollouts.episodes(policy, TASK, seeds=[0], steps=61, settings=LAYOUT)
+        rollouts.episodes(policy, LAYOUT, seeds=[0], steps=61)
+
+
+def test_the_vase_is_recorded_where_there_is_one():
+    envs = make_simulator("PointGoal1", 1)
+    transform = ObservationTransform.for_layout(envs.observation_layout)
+    actor = StackedMLP(1, (transform.dim, 8, 4), "elu", generator=torch.Generator().manual_seed(0))
+    recorded = rollouts.episodes(
+        Policy(transform, actor, squash=True), "PointGoal1", seeds=[5], steps=3
+    )
+    envs.reset(seed=[5])
+    np.testing.assert_allclose(
+        data.scene_at(recorded, episode=0, step=0).vase, envs.scene(0).vase, atol=1e-6
+    )
+    envs.close()
 
 
 def test_multiplier_map_is_the_energy_of_a_moving_robot_around_the_obstacles(policy):

@@ -35,13 +35,47 @@ def test_mean_interval_is_the_one_sample_t_interval():
     np.testing.assert_allclose(estimate[:3], (FIVE.mean(), interval.low, interval.high), rtol=1e-12)
 
 
-def test_mean_interval_of_two_runs_by_hand():
-    # n = 2: s / sqrt(2) = |x1 - x2| / 2 and t(1) at 97.5% is tan(pi (0.975 - 0.5))
-    estimate = statistics.mean_interval(np.array([1.0, 2.0]))
-    assert estimate.half_width == pytest.approx(0.5 * np.tan(0.475 * np.pi))
+def test_mean_interval_of_three_runs_by_hand():
+    # t(2) at a two-sided level L is L sqrt(2 / (1 - L^2)); s = 1
+    estimate = statistics.mean_interval(np.array([1.0, 2.0, 3.0]))
+    assert estimate.half_width == pytest.approx(0.95 * np.sqrt(2 / (1 - 0.95**2)) / np.sqrt(3))
 
 
-@pytest.mark.parametrize(("values", "count"), [([], 0), ([3.0], 1), ([np.nan], 0)])
+def test_an_interval_ends_at_the_bounds_of_its_quantity():
+    shares = np.array([1.0, 1.0, 0.9])
+    free = statistics.mean_interval(shares)
+    kept = statistics.mean_interval(
+        shares, bounds=statistics.bounds_of("eval_zero_violation_share")
+    )
+    assert free.high > 1
+    assert kept == (free.mean, free.low, 1.0, 3)
+    costs = np.array([0.0, 0.0, 3.0])
+    assert statistics.mean_interval(costs).low < 0
+    for metric in ("eval_cost", "train_cost_indicator", "train_violations", "eval_goals"):
+        assert statistics.mean_interval(costs, bounds=statistics.bounds_of(metric)).low == 0
+    assert statistics.bounds_of("eval_return") == statistics.UNBOUNDED
+
+
+@pytest.mark.parametrize("metric", ["eval_cost", "eval_zero_violation_share"])
+def test_tables_and_curves_use_the_bounds(metric):
+    values = {("t", "A", seed): [value] for seed, value in enumerate((0.0, 0.0, 1.0))}
+    progress = tidy(values, metric=metric)
+    scores = progress.drop(columns="step")
+    for table in (statistics.summarise(scores), statistics.learning_curves(progress, metric)):
+        assert table["low"].iloc[0] == 0
+        assert table["high"].iloc[0] == (
+            1.0 if "share" in metric else pytest.approx(1.768, abs=1e-3)
+        )
+
+
+def test_equal_runs_have_exactly_no_width_whatever_the_rounding_of_their_mean():
+    estimate = statistics.mean_interval(np.full(7, 0.1))
+    assert estimate.low == estimate.high == 0.1
+
+
+@pytest.mark.parametrize(
+    ("values", "count"), [([], 0), ([3.0], 1), ([np.nan], 0), ([3.0, 4.0], 2), ([3.0, 3.0], 2)]
+)
 def test_too_few_runs_have_no_interval(values, count):
     estimate = statistics.mean_interval(np.array(values))
     assert estimate.size == count
@@ -140,13 +174,29 @@ def test_improvement_probability_of_separated_samples_is_certain():
 
 
 def test_performance_profile_is_the_survival_function_averaged_over_tasks():
-    samples = {"a": np.array([0.2, 0.6]), "b": np.array([0.5, 0.5, 1.5, 2.0])}
+    samples = {"a": np.array([0.2, 0.6, 0.2, 0.6]), "b": np.array([0.5, 0.5, 1.5, 2.0])}
     profile = statistics.performance_profile(
         samples, np.array([0.0, 0.5, 1.0, 3.0]), replicates=200
     )
     np.testing.assert_allclose(profile["mean"], [1.0, 0.5, 0.25, 0.0])
     assert (profile["low"] <= profile["mean"]).all()
     assert (profile["mean"] <= profile["high"]).all()
+
+
+def test_two_runs_have_no_interval_of_any_kind():
+    two, five = np.array([1.0, 2.0]), np.arange(5.0) + 3
+    found = [
+        statistics.difference_interval(two, five),
+        statistics.improvement_interval(five, two),
+        statistics.stratified_bootstrap({"t": two, "u": five}, statistics.pooled_iqm),
+        statistics.improvement_probability({"t": five}, {"t": two}),
+    ]
+    assert all(np.isnan([estimate.low, estimate.high]).all() for estimate in found)
+    assert [estimate.size for estimate in found] == [2] * 4
+    assert not any(np.isnan(estimate.mean) for estimate in found)
+    profile = statistics.performance_profile({"t": two}, np.array([1.5]))
+    assert profile["mean"].tolist() == [0.5]
+    assert profile[["low", "high"]].isna().all(axis=None)
 
 
 def test_final_scores_average_the_last_tenth_of_the_evaluations():

@@ -103,7 +103,8 @@ def test_written_forms_hold_the_same_numbers(scores, tmp_path, ending):
     else:
         mean = statistics.mean_interval(np.array(RETURNS[TASK, "SafeMR"])).mean
         assert f"{mean:.2f} " in text
-        assert "[" not in text, "the IQM of three seeds is their mean"
+        (row,) = [line for line in text.splitlines() if "SafeMR" in line and TASK in line]
+        assert "[" not in row, "the IQM of three seeds is their mean"
         assert ("$\\pm$" in text) == (ending == "tex")
 
 
@@ -136,7 +137,7 @@ def test_no_run_at_all_still_makes_every_table(scores):
     for table in (
         tables.table_one(nothing, missing=missing),
         tables.full_results(nothing, missing=missing),
-        tables.push_split(nothing, missing=missing),
+        tables.push_split(nothing, [OTHER], missing=missing),
         comparisons.differences(nothing, missing=missing),
         sensitivity.table_two(nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
         sensitivity.weight_map(nothing, nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
@@ -191,15 +192,75 @@ def test_weight_map_tells_what_the_weights_do_over_all_points():
 def test_push_returns_are_split_into_their_parts():
     rows = [(OTHER, name, seed, metric, value)
             for name, parts in (("SafeMR", (1.5, 0.2)), ("scripted: pushes the box", (1.5, 2.4)))
-            for seed in (0, 1)
+            for seed in (0, 1, 2)
             for metric, value in zip(("eval_reward_approach", "eval_reward_push"), parts,
                                      strict=True)]  # fmt: skip
-    split = tables.push_split(
-        pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
-    )
+    scores = pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+    named = scores.assign(task="Doors-Reach")  # whatever it is called
+    split = tables.push_split(pd.concat([scores, named]), ["Doors-Reach"])
+    assert {row[0] for row in cells(split)[2:]} == {"Doors-Reach"}
     found = {row[1]: row[5:7] for row in cells(split)[2:]}
-    assert found["SafeMR"] == ["1.50 ± 0.00", "0.20 ± 0.00"]
-    assert found["scripted: pushes the box"][1] == "2.40 ± 0.00"
+    assert found["SafeMR"] == ["1.50", "0.20"], "equal seeds are no interval"
+    assert found["scripted: pushes the box"][1] == "2.40"
+
+
+def test_an_interval_is_printed_as_what_it_is():
+    assert tables.plus_minus(1.0, 0.5, 1.5, 2) == "1.00 ± 0.50"
+    assert tables.plus_minus(98.0, 93.0, 103.0, 1, "%") == "98.0 ± 5.0%"
+    assert tables.plus_minus(98.0, 93.0, 100.0, 1, "%") == "98.0% [93.0, 100.0]"
+    assert tables.plus_minus(100.0, 100.0, 100.0, 1, "%") == "100.0%"
+    assert tables.plus_minus(3.0, np.nan, np.nan, 2) == "3.00"
+    assert tables.plus_minus(np.nan, np.nan, np.nan, 2) == tables.MISSING
+
+
+def test_results_of_equal_and_of_two_seeds_have_no_interval(scores):
+    table = tables.full_results(scores)
+    shown = table.display.set_index(["task", "algorithm"])
+    assert shown.loc[(TASK, "SafeMR"), "clean episodes"] == "100.0%"
+    assert shown.loc[(TASK, "SafeMR"), "violating steps"] == "0.00"
+    assert shown.loc[(TASK, "CPO"), "violating steps"].startswith("31.67 ± ")
+    two = tables.full_results(scores[scores["seed"] < 2]).display
+    assert not two.apply(lambda column: column.str.contains("±|\\[")).any(axis=None)
+    assert set(two["seeds"]) == {"2"}
+
+
+def test_nothing_of_the_paper_stands_beside_a_task_that_it_did_not_run(scores):
+    other = scores[scores["task"] == TASK].assign(task="Pillars-8")
+    both = tables.table_one(pd.concat([scores, other]), tasks=[TASK, "Pillars-8"]).display
+    both = both.set_index("Expected return")
+    assert both.loc["Paper: SafeMR"].tolist() == ["10.034", tables.ABSENT]
+    assert both.loc["Paper: improvement, printed", "Pillars-8"] == tables.ABSENT
+    alone = tables.table_one(other, tasks=["Pillars-8"]).display
+    assert not alone["Expected return"].str.contains("Paper").any()
+    learned = pd.DataFrame(
+        [(task, "SafeMR", seed, name, 1.0 + seed)
+         for task in (TASK, OTHER) for seed in range(3) for name in ("sigma", "k", "n")],
+        columns=["task", "variant", "seed", "metric", "value"],
+    )  # fmt: skip
+    points = {"SafeMR": reference.HEADLINE}
+    for task, papers in ((TASK, True), (OTHER, False)):
+        table = sensitivity.table_two(learned, points, task=task)
+        assert ("paper" in set(table.data["seed"])) == papers
+        assert ("paper" in table.caption) == papers
+
+
+def test_two_seeds_leave_out_the_half_width_rather_than_call_it_missing():
+    learned = pd.DataFrame(
+        [(TASK, "SafeMR", seed, name, 1.0 + seed)
+         for seed in (0, 1) for name in ("sigma", "k", "n")],
+        columns=["task", "variant", "seed", "metric", "value"],
+    )  # fmt: skip
+    table = sensitivity.table_two(learned, {"SafeMR": reference.HEADLINE})
+    assert tables.MISSING not in table.markdown()
+    assert set(table.data["seed"]) == {"0", "1", "mean", "paper"}
+
+
+def test_rows_of_a_task_stay_together_whatever_it_is_called(scores):
+    ours = scores[scores["task"] == TASK]
+    mixed = pd.concat([ours.assign(task=name) for name in ("Doors-Reach", TASK, "Pillars-8")])
+    found = [row[0] for row in cells(tables.full_results(mixed))[2:]]
+    assert list(dict.fromkeys(found)) == [TASK, "Doors-Reach", "Pillars-8"]
+    assert found == sorted(found, key=[TASK, "Doors-Reach", "Pillars-8"].index)
 
 
 def test_the_iqm_is_shown_where_it_is_not_the_mean(scores):

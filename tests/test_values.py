@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from safemr import runs, strict_yaml, train
+from safemr import catalogue, strict_yaml
 from safemr.errors import UserError
 
 
@@ -23,7 +23,7 @@ from safemr.errors import UserError
 )
 def test_values_of_a_command_line(text: str, value: Any) -> None:
     assert strict_yaml.typed(text) == value
-    assert train._override(f"gamma={text}") == ("gamma", value)
+    assert strict_yaml.assignment(f"gamma={text}") == ("gamma", value)
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_values_of_a_command_line(text: str, value: Any) -> None:
     ],
 )
 def test_coercion_keeps_types(value: Any, hint: Any, expected: Any) -> None:
-    result = runs.coerce(value, hint, "x")
+    result = catalogue.coerce(value, hint, "x")
     assert result == expected
     assert type(result) is type(expected)
 
@@ -58,4 +58,4 @@ def test_coercion_keeps_types(value: Any, hint: Any, expected: Any) -> None:
 )
 def test_coercion_refuses_what_is_not_the_type(value: Any, hint: Any) -> None:
     with pytest.raises(UserError, match="x must be"):
-        runs.coerce(value, hint, "x")
+        catalogue.coerce(value, hint, "x")

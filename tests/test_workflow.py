@@ -274,6 +274,10 @@ def marker(checkout: Checkout, output: str) -> Path:
     return path
 
 
+def names_of(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
 def lock_outputs(checkout: Checkout) -> None:
     """The lock that a killed Snakemake leaves."""
     folder = checkout.folder / ".snakemake/locks"
@@ -295,6 +299,24 @@ def test_what_a_killed_snakemake_leaves_needs_no_manual_step(checkout: Checkout)
     assert not any(mark.exists() for mark in marks)
     assert (checkout.folder / provenance).read_bytes() == before
     assert half_written.read_text().startswith("task,")
+
+
+def test_what_another_workflow_left_in_the_same_folder_stays(checkout: Checkout) -> None:
+    """Recovery clears what this workflow makes; other files and locks are their owners'."""
+    checkout.fill_in_records()
+    own = checkout.folder / "mapped/reads.bam"
+    own.parent.mkdir()
+    own.write_text("days of work")
+    mark = marker(checkout, "mapped/reads.bam")
+    lock_outputs(checkout)
+    lock = checkout.folder / ".snakemake/locks/1.output.lock"
+    lock.write_text("mapped/reads.bam\n")
+    checkout.snakemake("aggregate", "-n")
+    assert names_of(lock.parent) == {"1.output.lock"}, "ours is cleared, theirs is not"
+    checkout.snakemake("aggregate")  # which clears all locks at its own end
+    assert own.read_text() == "days of work"
+    assert mark.exists()
+    assert (checkout.folder / "results/summary/runs.csv").exists()
 
 
 def test_a_live_snakemake_keeps_its_lock(checkout: Checkout) -> None:
@@ -382,7 +404,8 @@ def test_two_snakemakes_at_once_train_every_run_once(checkout: Checkout) -> None
 @pytest.mark.slow
 def test_a_diverging_run_stops_alone(checkout: Checkout) -> None:
     """The rest of the grid goes on, the failure is not tried again, and the summary names it."""
-    diverging = {"algorithm": "safemr", "policy_lr": 1.0e30, "start_steps": 200}
+    diverging = {"algorithm": "safemr", "target_entropy": 1.386, "temperature_lr": 1.0}
+    diverging["start_steps"] = 200
     checkout.configure(seeds=[100], algorithms={"Lost": diverging, **GRID["algorithms"]})
     printed = checkout.snakemake("all", "--keep-going", check=False)
     recorded = {run.variant for run in checkout.plan().runs

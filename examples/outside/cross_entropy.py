@@ -80,8 +80,9 @@ def search(config: Mapping[str, Any]) -> list[dict[str, float]]:
     evaluation = config["evaluation"]
 
     def make(count: int) -> Any:
+        registered = task.get("base", task["name"])  # a task with other settings has its own name
         return gymnasium.make_vec(
-            f"{task['name']}-v0", count, "vector_entry_point", **task["settings"]
+            f"{registered}-v0", count, "vector_entry_point", **task["settings"]
         )
 
     environments, test = make(population), make(evaluation["episodes"])

@@ -26,6 +26,7 @@ those of `trpo_lagrangian`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -50,13 +51,13 @@ PUBLISHED: dict[str, Any] = {**on_policy.PUBLISHED, "cost_tolerance": 0.0}
 class Config(TrustRegionConfig, OnPolicyConfig):
     """Hyperparameters; the two parents have the shared ones."""
 
-    # Predicted changes of an episode's cost below this count as none: a trust region that promises
+    # predicted changes of an episode's cost below this count as none: a trust region that promises
     # no more has no cost gradient (case 4), and the line search forgives as much. With 0 (as
     # published) an epoch without violations can end learning: c = 0 makes a plane of whatever noise
-    # is left in the cost critic, and the surrogate's curvature refuses every step along that plane.
+    # is left in the cost critic, and the surrogate's curvature refuses every step along that plane
     cost_tolerance: float = 0.01
 
-    NOT_NEGATIVE: ClassVar[tuple[str, ...]] = ("cost_tolerance",)
+    RANGES: ClassVar[Mapping[str, str]] = {"cost_tolerance": "[0, inf)"}
 
 
 @dataclass(frozen=True)

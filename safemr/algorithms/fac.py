@@ -25,6 +25,7 @@ smaller networks for a budget two orders of magnitude smaller.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -35,7 +36,7 @@ from torch import Tensor
 
 from safemr import energy, off_policy
 from safemr.buffers import Batch
-from safemr.errors import UserError
+from safemr.hyperparameters import Hyperparameters, Setting
 from safemr.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.policies import network_arrays
 from safemr.training import generator
@@ -51,87 +52,138 @@ REWARD_CRITICS = 2  # twin critics; the constraint critic is the third member of
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Hyperparameters):
     """Hyperparameters. Lengths in units of ``length_scale`` metres; steps are environment steps."""
 
-    # Energy function: start (FAC: constant) of zeta = [sigma, k, n].
-    sigma: float = 0.3
-    k: float = 1.0
-    n: float = 2.0
+    # Energy function
+
+    sigma: float = 0.3  # of zeta = [sigma, k, n]: margin of phi beyond d_min; FAC keeps zeta
+    k: float = 1.0  # of zeta: weight of the closing speed in phi
+    n: float = 2.0  # of zeta: exponent of phi
     eta: float = 0.0  # eta_D; the point robot cannot sustain a descent of 0.1 a step
     length_scale: float = 1.0  # unit of length in phi [m]; 1 = the paper's
 
-    # Constraint: one function, max(g, constraint_floor), for critic, multiplier and certificate.
-    # Far from danger g is large and negative; without a floor it outweighs the rare violations in
-    # the shared multiplier network and lambda dies.
+    # Constraint
+
+    # floor of the one function max(g, constraint_floor) in critic, multiplier and certificate:
+    # far from danger g is large and negative, and without a floor it outweighs the rare violations
+    # in the shared multiplier network, and lambda dies
     constraint_floor: float = -0.001
     constraint_scale: float = 10.0  # Q_phi learns scale * g, so that its errors count beside Q_w's
 
-    # Multiplier network lambda(s) = softplus(.), capped.
+    # Multiplier network lambda(s) = softplus(.), capped
+
     multiplier_bias: float = -3.0  # start of the last layer's bias
-    multiplier_cap: float = 100.0
-    multiplier_lr: float = 3e-4
-    multiplier_grad_norm: float = 3.0
-    multiplier_action: Literal["policy", "replay"] = "policy"
+    multiplier_cap: float = 100.0  # largest lambda(s)
+    multiplier_lr: float = 3e-4  # learning rate of the multiplier network
+    multiplier_grad_norm: float = 3.0  # its gradient is clipped to this norm
+    multiplier_action: Literal["policy", "replay"] = "policy"  # where it is trained
 
-    # Soft actor-critic.
-    gamma: float = 0.99
-    polyak: float = 0.005
-    n_step: int = 5
-    critic_lr: float = 1e-3
-    policy_lr: float = 1e-3
-    temperature_lr: float = 3e-4
-    initial_log_temperature: float = -4.0
-    target_entropy: float = -2.0
+    # Soft actor-critic
+
+    gamma: float = 0.99  # discount of the reward; below 1, as time limits are bootstrapped through
+    polyak: float = 0.005  # share by which the target critics follow in a gradient step
+    n_step: int = 5  # rewards summed before the bootstrap
+    critic_lr: float = 1e-3  # learning rate of the three critics
+    policy_lr: float = 1e-3  # learning rate of the policy
+    temperature_lr: float = 3e-4  # learning rate of log alpha
+    initial_log_temperature: float = -4.0  # log alpha at the start
+    target_entropy: float = -2.0  # of the policy [nats]; below A log 2, that of random actions
     lr_final: float = 0.1  # every learning rate falls linearly to this share of its start
-    hidden: int = 64
-    activation: Activation = "relu"
+    hidden: int = 64  # units of each of the two hidden layers
+    activation: Activation = "relu"  # of the hidden layers
 
-    # Delays in gradient steps (Algorithm 1).
-    policy_delay: int = 2  # m_pi
-    multiplier_delay: int = 4  # m_lambda
+    # Delays in gradient steps (Algorithm 1)
 
-    # Experience.
-    num_envs: int = 16
+    policy_delay: int = 2  # m_pi: gradient steps for one of the policy
+    multiplier_delay: int = 4  # m_lambda: gradient steps for one of the multiplier
+
+    # Experience
+
+    num_envs: int = 16  # environments stepped together
     update_every: int = 8  # environment steps per gradient step
     updates_together: int = 4  # gradient steps done in one go, sharing one draw and its targets
-    batch_size: int = 256
-    replay_capacity: int = 500_000
-    start_steps: int = 5_000  # random actions first,
-    start_hold: int = 10  # each held for this many steps
-    device: str = "cpu"
+    batch_size: int = 256  # transitions a gradient step
+    replay_capacity: int = 500_000  # transitions kept
+    start_steps: int = 5_000  # random actions first, without learning
+    start_hold: int = 10  # steps for which each of them is held
+    device: str = "cpu"  # PyTorch's name of the device that learns
     backend: Literal["fused", "torch"] = "fused"  # compiled kernels (CPU only), or autograd
 
+    RANGES: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(("sigma", "n", "eta"), "[0, 10]"),
+        "k": "[0, 100]",
+        **dict.fromkeys(("length_scale", "constraint_scale"), "[0.001, 1000]"),
+        "constraint_floor": "[-inf, 0]",
+        "multiplier_bias": "[-100, 100]",
+        **dict.fromkeys(("multiplier_cap", "multiplier_grad_norm"), "(0, 1e6]"),
+        # Adam moves every parameter by about its rate a step: beyond 1 it only jumps about.
+        **dict.fromkeys(("critic_lr", "policy_lr", "multiplier_lr", "temperature_lr"), "(0, 1]"),
+        "gamma": "[0, 1)",
+        "polyak": "(0, 1]",
+        "lr_final": "[0, 1]",
+        "n_step": "[1, 1000]",
+        "initial_log_temperature": "[-30, 5]",
+        "target_entropy": "[-1000, inf)",
+        "hidden": "[1, 4096]",
+        **dict.fromkeys(("policy_delay", "multiplier_delay"), "[1, inf)"),
+        "num_envs": "[1, 4096]",
+        **dict.fromkeys(("update_every", "updates_together", "start_hold"), "[1, inf)"),
+        "batch_size": "[1, 1e6]",
+        "replay_capacity": "[1, 1e8]",
+        "start_steps": "[0, inf)",
+    }
+    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "activation": ACTIVATIONS,
+        "multiplier_action": ("policy", "replay"),
+        "backend": ("fused", "torch"),
+    }
+
     def __post_init__(self) -> None:
-        positive = (
-            "length_scale constraint_scale multiplier_cap multiplier_lr multiplier_grad_norm "
-            "critic_lr policy_lr temperature_lr n_step hidden policy_delay multiplier_delay "
-            "num_envs update_every updates_together batch_size replay_capacity start_hold"
+        super().__post_init__()
+        self.require(
+            "multiplier_delay",
+            self.multiplier_delay % self.policy_delay == 0,
+            f"must be a multiple of policy_delay = {self.policy_delay}: the multiplier uses that "
+            "step's policy action",
         )
-        for name in positive.split():
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
-        for name in ("sigma", "k", "n", "eta", "start_steps"):
-            if not getattr(self, name) >= 0:
-                raise UserError(f"{name} = {getattr(self, name)!r} must not be negative")
-        for name in ("gamma", "polyak", "lr_final"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UserError(f"{name} = {getattr(self, name)!r} must lie in [0, 1]")
-        if self.constraint_floor > 0:
-            raise UserError(f"constraint_floor = {self.constraint_floor!r} must not be positive")
-        if self.multiplier_delay % self.policy_delay:
-            raise UserError(
-                f"multiplier_delay = {self.multiplier_delay} must be a multiple of policy_delay = "
-                f"{self.policy_delay}: the multiplier uses that step's policy action"
+        self.require(
+            "batch_size",
+            self.batch_size <= self.replay_capacity,
+            f"must not exceed replay_capacity = {self.replay_capacity}",
+        )
+
+    def delays(self) -> tuple[str, ...]:
+        """Fields that hold numbers of gradient steps between two of one kind."""
+        return ("updates_together", "policy_delay", "multiplier_delay")
+
+    def check_setting(self, setting: Setting) -> None:
+        most = setting.action_dim * math.log(2.0)
+        self.require(
+            "target_entropy",
+            self.target_entropy < most,
+            f"must lie below A log 2 = {most:.4g}, the entropy of random actions in "
+            f"[-1, 1]^{setting.action_dim}: no policy has more, and the temperature would grow "
+            "without end",
+        )
+        self.require(
+            "n_step",
+            self.n_step <= setting.episode_steps,
+            f"must not exceed the {setting.episode_steps} steps of an episode",
+        )
+        self.require(
+            "start_steps",
+            self.start_steps < setting.total_steps,
+            f"must lie below the budget of {setting.total_steps} steps, or nothing is learned",
+        )
+        updates = (setting.total_steps - self.start_steps) // self.update_every
+        for name in self.delays():
+            self.require(
+                name,
+                getattr(self, name) <= updates,
+                f"must not exceed the run's {updates} gradient steps ((budget - start_steps) / "
+                "update_every)",
             )
-        choices: dict[str, tuple[str, ...]] = {
-            "activation": ACTIVATIONS,
-            "multiplier_action": ("policy", "replay"),
-            "backend": ("fused", "torch"),
-        }
-        for name, known in choices.items():
-            if getattr(self, name) not in known:
-                raise UserError(f"{name} = {getattr(self, name)!r}: use one of {known}")
 
 
 def reward_target(

@@ -19,15 +19,15 @@ allows it to be: see docs/tuning.md.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from safemr.algorithms import fac
 from safemr.buffers import Batch
-from safemr.errors import UserError
 
 VERSION = 1
 
@@ -36,35 +36,40 @@ VERSION = 1
 class Config(fac.Config):
     """FAC's hyperparameters and those of the certificate; sigma, k, n are zeta's start."""
 
+    # g in the certificate's loss: max(g, constraint_floor), the paper's g, or the released code's
+    # max(g, 0) without lambda
     certificate_constraint: Literal["floored", "literal", "released"] = "floored"
-    certificate_delay: int = 16  # m_phi
-    # Sum over the run of zeta's learning rates (they fall linearly to 0), so that budgets of
-    # different length move zeta equally far: it is a hyperparameter, equal for JointSIS and SafeMR.
+    certificate_delay: int = 16  # m_phi: gradient steps for one of zeta
+    # sum over the run of zeta's learning rates (they fall linearly to 0), so that budgets of
+    # different length move zeta equally far; equal for JointSIS and SafeMR
     certificate_travel: float = 0.33
     certificate_start: float = 0.05  # share of training before zeta moves
-    # Box of zeta; the floor of sigma keeps a margin beyond contact.
-    sigma_min: float = 0.05
-    sigma_max: float = 1.0
-    k_min: float = 0.1
-    k_max: float = 3.0
-    n_min: float = 0.1
-    n_max: float = 4.0
+    sigma_min: float = 0.05  # box of zeta: least sigma, which keeps a margin beyond contact
+    sigma_max: float = 1.0  # box of zeta: largest sigma
+    k_min: float = 0.1  # box of zeta: least k
+    k_max: float = 3.0  # box of zeta: largest k
+    n_min: float = 0.1  # box of zeta: least n
+    n_max: float = 4.0  # box of zeta: largest n
+
+    RANGES: ClassVar[Mapping[str, str]] = {
+        "certificate_delay": "[1, inf)",
+        "certificate_travel": "[0, 1e6]",
+        "certificate_start": "[0, 1)",
+        **dict.fromkeys(("sigma_min", "sigma_max", "n_min", "n_max"), "[0, 10]"),
+        **dict.fromkeys(("k_min", "k_max"), "[0, 100]"),
+    }
+    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "certificate_constraint": ("floored", "literal", "released"),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("sigma", "k", "n"):
             low, high = getattr(self, f"{name}_min"), getattr(self, f"{name}_max")
-            if not low <= getattr(self, name) <= high:
-                raise UserError(f"{name} = {getattr(self, name)!r} must lie in [{low}, {high}]")
-        if not (self.certificate_delay > 0 and self.certificate_travel >= 0):
-            raise UserError("certificate_delay must be positive, certificate_travel not negative")
-        if not 0 <= self.certificate_start < 1:
-            raise UserError(f"certificate_start = {self.certificate_start!r} must lie in [0, 1)")
-        if self.certificate_constraint not in ("floored", "literal", "released"):
-            raise UserError(
-                f"certificate_constraint = {self.certificate_constraint!r}: use 'floored', "
-                "'literal' or 'released'"
-            )
+            self.require(name, low <= getattr(self, name) <= high, f"must lie in [{low}, {high}]")
+
+    def delays(self) -> tuple[str, ...]:
+        return (*super().delays(), "certificate_delay")
 
 
 def certificate_loss(

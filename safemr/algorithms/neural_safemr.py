@@ -29,8 +29,9 @@ of its own. docs/aircraft.md reports what this does.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -39,7 +40,6 @@ from torch import Tensor
 from safemr import energy
 from safemr.algorithms import fac
 from safemr.buffers import Batch
-from safemr.errors import UserError
 from safemr.networks import StackedMLP
 from safemr.policies import network_arrays
 from safemr.training import generator
@@ -55,27 +55,30 @@ class Config(fac.Config):
     a: float = 10.0  # weight of the magnitude term
     smoothing: float = 0.1  # tau, in units of length_scale
     certificate_hidden: int = 32  # width of f's two hidden layers (tanh)
-    certificate_lr: float = 1e-3
-    certificate_delay: int = 4  # m_phi
+    certificate_lr: float = 1e-3  # learning rate of f
+    certificate_delay: int = 4  # m_phi: gradient steps for one of theta
     certificate_start: float = 0.05  # share of training before theta moves
+    # of max(phi(s) - eta_D, 0) in the certificate's loss: 1 everywhere, or the paper's own
     certificate_derivative: Literal["through", "literal"] = "through"
+
+    RANGES: ClassVar[Mapping[str, str]] = {
+        "a": "[0, 1e6]",
+        "smoothing": "(0, 1000]",
+        "certificate_hidden": "[1, 4096]",
+        "certificate_lr": "(0, 1]",
+        "certificate_delay": "[1, inf)",
+        "certificate_start": "[0, 1)",
+    }
+    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "certificate_derivative": ("through", "literal"),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("smoothing", "certificate_hidden", "certificate_lr", "certificate_delay"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name} = {getattr(self, name)!r} must be positive")
-        if not self.a >= 0:
-            raise UserError(f"a = {self.a!r} must not be negative")
-        if not 0 <= self.certificate_start < 1:
-            raise UserError(f"certificate_start = {self.certificate_start!r} must lie in [0, 1)")
-        if self.n_step != 1:
-            raise UserError(f"n_step = {self.n_step!r} must be 1: the energy needs the next state")
-        if self.certificate_derivative not in ("through", "literal"):
-            raise UserError(
-                f"certificate_derivative = {self.certificate_derivative!r}: use 'through' or "
-                "'literal'"
-            )
+        self.require("n_step", self.n_step == 1, "must be 1: the energy needs the next state")
+
+    def delays(self) -> tuple[str, ...]:
+        return (*super().delays(), "certificate_delay")
 
 
 def neural_energy(

@@ -46,19 +46,18 @@ PUBLISHED: dict[str, Any] = {
 class Config(MultiplierConfig, OnPolicyConfig):
     """Hyperparameters; `OnPolicyConfig` and `MultiplierConfig` have the shared ones."""
 
-    clip: float = 0.2
-    policy_lr: float = 3e-4
+    clip: float = 0.2  # epsilon of the clipped objective
+    policy_lr: float = 3e-4  # learning rate of the policy
     policy_passes: int = 10  # at most, over the epoch's data
-    policy_batch: int = 500  # samples a policy step
+    policy_batch: int = 500  # samples a policy step; at most the whole epoch
     kl_stop: float = 1.2  # stop the passes where KL > kl_stop * target_kl
 
-    POSITIVE: ClassVar[tuple[str, ...]] = (
-        "clip",
-        "policy_lr",
-        "policy_passes",
-        "policy_batch",
-        "kl_stop",
-    )
+    RANGES: ClassVar[Mapping[str, str]] = {
+        "clip": "(0, 1)",
+        "policy_lr": "(0, 1]",
+        **dict.fromkeys(("policy_passes", "policy_batch"), "[1, inf)"),
+        "kl_stop": "(0, 100]",
+    }
 
 
 def clipped_surrogate(ratio: Tensor, advantages: Tensor, clip: float) -> Tensor:

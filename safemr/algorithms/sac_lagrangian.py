@@ -23,15 +23,15 @@ The limit is a rate (cost a step), so that it needs no conversion between episod
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from safemr.algorithms import fac
 from safemr.buffers import Batch
-from safemr.errors import UserError
 from safemr.networks import StackedMLP
 
 VERSION = 1
@@ -42,24 +42,21 @@ ENERGY_FIELDS = ("sigma", "k", "n", "eta", "length_scale", "constraint_floor")
 
 @dataclass(frozen=True)
 class Config(fac.Config):
-    """FAC's hyperparameters, of which the energy's must be left alone."""
+    """FAC's hyperparameters, of which the energy's are not used."""
 
     cost_rate_limit: float = 0.0  # tolerated cost a step
     n_step: int = 1  # the memory forms n-step sums of rewards only
     constraint_scale: float = 1.0  # a discounted cost is of the size of a discounted reward
     multiplier_bias: float = 0.0  # softplus(0) = 0.69: felt from the start, as in PPO-Lagrangian
 
+    RANGES: ClassVar[Mapping[str, str]] = {"cost_rate_limit": "[0, 100]"}
+    UNUSED: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ENERGY_FIELDS, "there is no energy function"
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        for field in fields(fac.Config):
-            if field.name in ENERGY_FIELDS and getattr(self, field.name) != field.default:
-                raise UserError(
-                    f"{field.name}: sac_lagrangian has no energy function; leave it out"
-                )
-        if self.n_step != 1:
-            raise UserError(f"n_step = {self.n_step}: sac_lagrangian needs 1")
-        if self.cost_rate_limit < 0:
-            raise UserError(f"cost_rate_limit = {self.cost_rate_limit!r} must not be negative")
+        self.require("n_step", self.n_step == 1, "sac_lagrangian needs 1")
 
 
 def cost_target(costs: Tensor, discounts: Tensor, next_values: Tensor, rate_limit: float) -> Tensor:

@@ -10,14 +10,15 @@ With a = b = 0 this is JointSIS, number for number. Deviations: those of `joint_
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import Tensor
 
 from safemr import energy
 from safemr.algorithms import joint_sis
 from safemr.buffers import Batch
-from safemr.errors import UserError
 
 VERSION = 1
 
@@ -29,11 +30,7 @@ class Config(joint_sis.Config):
     a: float = 0.35  # weight of (sigma + d_min)^n
     b: float = 0.15  # weight of k
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("a", "b"):
-            if not getattr(self, name) >= 0:
-                raise UserError(f"{name} = {getattr(self, name)!r} must not be negative")
+    RANGES: ClassVar[Mapping[str, str]] = {"a": "[0, 1e6]", "b": "[0, 1e6]"}
 
 
 def certificate_loss(

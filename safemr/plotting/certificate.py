@@ -16,12 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from safemr.energy import constraint, energy, largest
 from safemr.feasibility import CONVENTIONS, radial_requirement
 from safemr.plotting import style
-from safemr.point_robot import PointRobot
+from safemr.point_robot import ROBOT
 from safemr.reference import Zeta
 
 Array = NDArray[np.float64]
 
-ROBOT = PointRobot()
 _PAPER = ("#000000", "#7A7A7A", "#B5B5B5")  # the paper's three sets
 _HANDCRAFTED = {"phi_0": "FAC-phi0", "phi_h": "FAC-phih"}
 
@@ -252,7 +251,8 @@ def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
     start = np.array([-0.9, -0.88]) * extent
     end = start + 0.3 * extent * style.steady([np.cos(heading), np.sin(heading)])
     ax.annotate("", tuple(end), tuple(start), arrowprops={"arrowstyle": "->", "lw": 1})
-    ax.set(aspect="equal", xticks=[-2, 0, 2], yticks=[-2, 0, 2], xlabel="$x$ (m)")
+    tick = np.floor(extent) or extent
+    ax.set(aspect="equal", xticks=[-tick, 0, tick], yticks=[-tick, 0, tick], xlabel="$x$ (m)")
     ax.grid(False)
     figure = ax.get_figure()
     assert figure is not None

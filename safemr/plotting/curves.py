@@ -94,7 +94,7 @@ def compute_curves(
     """
     timed = returns.merge(minutes, on=["task", "variant", "step"])
     timed = timed.drop(columns="step").rename(columns={"minutes": "step"})
-    variants = style.ordered(returns["variant"].unique())
+    variants = style.ordered(timed["variant"].unique())  # whose records say what they cost
     crowded = len(tasks) == 1 and len(variants) > 8
     figure = style.new_figure(style.TEXT_WIDTH, 2.9 if crowded else 2.1)
     if crowded:

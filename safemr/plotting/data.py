@@ -24,13 +24,14 @@ GEOMETRY = ("obstacle_size", "d_min", "goal_size", "extent", "solid_obstacles")
 def scene_at(data: Arrays, episode: int, step: int) -> SimpleNamespace:
     """One moment of `rollouts.episodes`, with the attributes of the environment's own scene."""
     box = data["box"][step, episode]
+    vase = data["vase"][step, episode] if "vase" in data else None
     return SimpleNamespace(
         task=SimpleNamespace(**{name: data[name].item() for name in GEOMETRY}),
         robot=data["robot"][step, episode],
         goal=data["goal"][step, episode],
         obstacles=data["obstacles"][episode],
         box=None if np.isnan(box).any() else box,
-        vase=None,  # none in the tasks that are recorded
+        vase=vase,
     )
 
 

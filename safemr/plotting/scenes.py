@@ -72,8 +72,9 @@ def animation(
     """A GIF of the variants side by side on one layout, in real time for stride 4 (80 ms a frame).
 
     One palette serves all frames, which keeps the file small; it loops for ever. Without any
-    recording it is one frame that says so.
+    recording it is one frame that says so, and a shorter recording ends earlier.
     """
+    steps = min([steps, *(len(data["robot"]) - 1 for data in recorded.values())])
     frames = [
         _frame_image(recorded, draw_scene, episode, step, pixels)
         for step in range(0, steps + 1, stride)

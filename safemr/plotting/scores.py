@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from safemr.plotting import style
-from safemr.statistics import Aggregates, Estimate
+from safemr.statistics import FEWEST_RUNS, Aggregates, Estimate
 
 
 def draw_return_against_cost(
@@ -130,13 +130,17 @@ def aggregate_scores(
     method: str = "SafeMR",
     name: str = "return",
     absent: Sequence[str] = (),
+    tasks: Sequence[str] = (),
 ) -> Figure:
-    """Performance profiles over all tasks, IQM of the normalised score, probability of improvement.
+    """Performance profiles over tasks, IQM of the normalised score, probability of improvement.
 
     aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn, but
-    named if it is among `absent`.
+    named if it is among `absent`. `tasks` are named where they are not all of the grid's. Where a
+    task has too few runs for intervals, the figure says so.
     """
     figure = style.new_figure(style.TEXT_WIDTH, 2.3)
+    if tasks:
+        figure.suptitle(f"on {', '.join(tasks)} alone", fontsize="small", color="0.4")
     left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
     draw_profiles(aggregates.profiles, left)
     if not aggregates.profiles:
@@ -147,6 +151,11 @@ def aggregate_scores(
     left.set_xlabel(rf"normalised {name} $\tau$ (paper's SafeMR: 1)")
     draw_intervals(aggregates.iqm, middle, neutral=1.0)
     middle.set_xlabel(f"IQM of normalised {name}")
+    runs = min((estimate.size for estimate in aggregates.iqm.values()), default=FEWEST_RUNS)
+    if runs < FEWEST_RUNS:
+        few = f"{runs} run{'s' * (runs > 1)} a task: no intervals"
+        for ax in (middle, right):
+            ax.set_title(few, fontsize="small", color="0.4", style="italic")
     draw_intervals(aggregates.improvement, right, neutral=0.5)
     right.set_xlim(-0.03, 1.03)
     right.set_xlabel(rf"$P$({style.label(method)} $>$ baseline)")
@@ -174,6 +183,7 @@ _MAPPED = {
 
 def draw_grid(data: pd.DataFrame, column: str, ax: Axes, *, number: str = "{:.2f}") -> Axes:
     """One value a point [a, b] as shade and number; data: `sensitivity.weight_map`'s."""
+    missing = "–" if column == "half_width" and data["return"].notna().all() else "missing"
     table = data.pivot(index="b", columns="a", values=column)
     values = table.to_numpy(float)
     known = values[np.isfinite(values)]
@@ -182,7 +192,7 @@ def draw_grid(data: pd.DataFrame, column: str, ax: Axes, *, number: str = "{:.2f
         low, high = low - 1.0, high + 1.0
     ax.imshow(values, origin="lower", cmap="viridis", vmin=low, vmax=high, aspect="auto")
     for (row, place), value in np.ndenumerate(values):
-        text = number.format(value) if np.isfinite(value) else "missing"
+        text = number.format(value) if np.isfinite(value) else missing
         dark = not np.isfinite(value) or value > low + 0.6 * (high - low)
         ax.text(place, row, text, ha="center", va="center", fontsize="small",
                 color="k" if dark else "w")  # fmt: skip

@@ -126,8 +126,11 @@ def load_or_solve(
                 stored["changes"],
                 float(stored["seconds"]),
             )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"cached solution {path} cannot be used ({error}): delete it") from error
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(f"cached solution {path} cannot be read: {reason}") from error
+    except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"cached solution {path} is damaged ({error}): delete it") from error
 
 
 def solve(dynamics: AircraftDynamics, grid: Grid | None = None, horizon: float = 2.8) -> Solution:

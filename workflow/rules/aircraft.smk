@@ -1,11 +1,14 @@
 # The aircraft experiment: its learners are runs of the one training rule. The solved truth is kept
 # in <results root>/.work/aircraft, which no record needs and a clone solves again (15 s).
+from safemr.recorded_energy import NEURAL as NEURAL_NAMES
+
 # Those with a neural energy function have a table and a figure of their own, and are made when
 # aircraft.algorithms has any.
-NEURAL_PLAN = [run for run in PLAN.aircraft if run.config["algorithm"]["name"] == "neural_safemr"]
+NEURAL_PLAN = [run for run in PLAN.aircraft if run.config["algorithm"]["name"] in NEURAL_NAMES]
 AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
 AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]
 NEURAL = [run for run in NEURAL_PLAN if run in RECORDED]
+ENCOUNTER = dict(PLAN.aircraft[0].config["task"]) if PLAN.aircraft else reference.AIRCRAFT_TASK
 AIRCRAFT_FIGURES = ["aircraft_slices", "aircraft_airplane", "aircraft_frontier"]
 
 
@@ -18,6 +21,7 @@ rule aircraft_frontier:
     params:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
+        task=ENCOUNTER,
         sources=sources("aircraft_frontier"),
     message:
         "Solving the aircraft's true unsafe sets and the frontier of the energy family"
@@ -41,6 +45,7 @@ rule aircraft_comparison:
     threads: 1
     params:
         cache=f"{RESULTS}/.work/aircraft",
+        task=ENCOUNTER,
         root=RESULTS,
         folders=[run.path.as_posix() for run in AIRCRAFT],
         expected=expected(AIRCRAFT_PLAN),
@@ -69,6 +74,7 @@ rule aircraft_figures:
     params:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
+        task=ENCOUNTER,
         sources=sources("aircraft_figures"),
     script:
         "../scripts/aircraft_figures.py"
@@ -98,6 +104,7 @@ rule aircraft_neural:
     threads: 1
     params:
         cache=f"{RESULTS}/.work/aircraft",
+        task=ENCOUNTER,
         root=RESULTS,
         folders=[run.path.as_posix() for run in NEURAL],
         expected=expected(NEURAL_PLAN),

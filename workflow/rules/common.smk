@@ -13,6 +13,7 @@ from safemr.config import load
 from safemr.errors import UserError
 from safemr.records import POLICY, PROVENANCE, REQUIRED_FILES
 from safemr.plan_cache import plan_for
+from safemr import reference
 from safemr.sources import digest
 
 # A file given by --configfile replaces whole top-level keys of the default, so that it can also
@@ -34,6 +35,16 @@ RUNS = {run.path.as_posix(): run for run in PLAN.runs}
 SUMMARY = f"{RESULTS}/summary"
 LOGS = f"{RESULTS}/logs"
 TARGETS = []  # each rules file adds what `all` must make
+
+
+def has(trait):
+    """Those of `tasks` whose environment has something: a name in `safemr.tasks.Traits`."""
+    return [task for task in CONFIG.tasks if getattr(PLAN.tasks[task].traits, trait)]
+
+
+def entries_of(names):
+    """Of some tasks, what their environments are made from."""
+    return [dict(PLAN.tasks[name].entry) for name in names]
 
 
 def record_files(runs):

@@ -6,7 +6,8 @@ TABLES = {
     "differences": "../report/differences.rst",
     "compute": "../report/compute.rst",
 }
-if any(task.endswith("-Push") for task in CONFIG.tasks):
+PUSH_TASKS = has("pushes_box")
+if PUSH_TASKS:
     TABLES["push_split"] = "../report/push_split.rst"
 
 
@@ -31,7 +32,8 @@ rule table_1:
         **GRID,
         **BUDGET,
         baselines=[*BASELINES, *CONFIG.outside],
-        push="push_split" in TABLES,
+        push=PUSH_TASKS,
+        layouts=CONFIG.evaluation.episodes,
         expected=expected((*PLAN.navigation, *PLAN.outside)),
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
@@ -72,15 +74,24 @@ def figure_outputs(*names):
     return {"pdf": [f"{FIGURES}/{name}.pdf" for name in names], "png": shown}
 
 
-# Illustrations: the paper's numbers and the tasks themselves, no record.
+# Illustrations: the paper's numbers, where its task is among them, and the tasks themselves; no
+# record.
+ILLUSTRATIONS = ["energy_and_safe_set", "narrow_passage"] * WITH_PAPERS
+ILLUSTRATIONS += ["environments"] * bool(ROBOT_TASKS)
+
+# Aggregates divide by the paper's returns, so that they are of its tasks alone.
+FINAL_SCORES = ["return_against_cost"]
+FINAL_SCORES += ["aggregate_scores", "aggregate_safe_scores"] * bool(PAPER_TASKS)
+
+
 rule illustrations:
     output:
-        **figure_outputs("energy_and_safe_set", "narrow_passage", "environments"),
+        **figure_outputs(*ILLUSTRATIONS),
     log:
         f"{LOGS}/illustrations.log",
     threads: 1
     params:
-        tasks=ROBOT_TASKS,
+        tasks=entries_of(ROBOT_TASKS),
         sources=sources("illustrations"),
     script:
         "../scripts/illustrations.py"
@@ -108,7 +119,7 @@ rule final_scores:
     input:
         scores=rules.aggregate.output.scores,
     output:
-        **figure_outputs("return_against_cost", "aggregate_scores", "aggregate_safe_scores"),
+        **figure_outputs(*FINAL_SCORES),
     log:
         f"{LOGS}/final_scores.log",
     threads: 1
@@ -182,9 +193,8 @@ rule rollouts:
             for variant in LEARNED
             if (wildcards.task, variant) in FIRST_RUNS
         },
-        settings=lambda wildcards: SETTINGS.get(wildcards.task, {}),
         layouts=[CONFIG.evaluation.seed + index for index in range(4)],
-        steps=400,
+        steps=lambda wildcards: min(400, PLAN.tasks[wildcards.task].traits.episode_steps),
         lacking=lambda wildcards: without_policy(
             run for run in FIRST_RUNS.values() if run.task == wildcards.task
         ),
@@ -212,11 +222,9 @@ rule policies:
         "../scripts/policies.py"
 
 
-TARGETS += [
-    *rules.illustrations.output,
-    *rules.compute_curves.output,
-    *rules.final_scores.output,
-]
+TARGETS += [*rules.compute_curves.output, *rules.final_scores.output]
+if ILLUSTRATIONS:
+    TARGETS += [*rules.illustrations.output]
 if LEARNED:
     TARGETS += [*rules.parameters.output]
 if LEARNED and ROBOT_TASKS:

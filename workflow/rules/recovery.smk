@@ -7,11 +7,12 @@
 # lock that every process holds to its end and that the kernel drops with it.
 import base64
 import fcntl
-import shutil
 from pathlib import Path
 
 from safemr.locks import ProcessLock
 
+# What this workflow makes; what others left in the same .snakemake is theirs.
+MADE = [Path(RESULTS, name) for name in ("runs", "summary", "tables", "logs")] + [Path(FIGURES)]
 IS_RECORD = re.compile(r"seed\d+-[0-9a-f]{12}").fullmatch
 
 
@@ -25,6 +26,11 @@ def marked_files(folder):
             continue
 
 
+def is_made(path):
+    """Whether a file is one of this workflow's."""
+    return any(Path(path).is_relative_to(folder) for folder in MADE)
+
+
 def recover(state):
     """Clear what a killed process left; returns the descriptor that says this one is alive."""
     state.mkdir(exist_ok=True)
@@ -34,8 +40,12 @@ def recover(state):
     except BlockingIOError:
         pass
     else:
-        shutil.rmtree(state / "locks", ignore_errors=True)
+        for lock in (state / "locks").glob("*.lock"):
+            if all(map(is_made, lock.read_text().splitlines())):
+                lock.unlink()
         for marker, output in marked_files(state / "incomplete"):
+            if not is_made(output):
+                continue
             # A record is complete or absent by itself; anything else may be half written.
             if not IS_RECORD(output.parent.name):
                 output.unlink(missing_ok=True)

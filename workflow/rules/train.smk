@@ -1,7 +1,8 @@
 # One training run. `exec` makes the trainer a child of Snakemake itself, so that it notices when
 # Snakemake is gone; its checkpoints live in <results root>/.work/<digest>/, which is no output, so
-# that a failed job keeps them. An orphan of a killed Snakemake is waited for. `tee -i` outlives the
-# Ctrl-C that the trainer answers with a checkpoint and a line.
+# that a failed job keeps them. An orphan of a killed Snakemake is waited for. The signals that the
+# trainer answers with a checkpoint and a line reach the whole process group: `tee` ignores them and
+# ends when the trainer has.
 RECORD = RESULTS + "/runs/{task}/{variant}/seed{seed}-{digest}"
 
 
@@ -23,9 +24,19 @@ rule train:
         resolved=lambda wildcards: run_of(wildcards).resolved,
         variant=lambda wildcards: run_of(wildcards).variant,
         root=RESULTS,
+    message:
+        "Training {wildcards.variant} on {wildcards.task}, seed {wildcards.seed}"
     shell:
         "exec {sys.executable:q} -u -m safemr.train --resolved {params.resolved:q}"
         " --variant {params.variant:q} --root {params.root:q} --die-with-parent --wait"
         # The mirror is no part of a run: what is not in `params` does not make it train again.
         " --wandb {CONFIG.wandb_mode:q} --wandb-project {CONFIG.wandb_project:q}"
-        " >> {log:q} 2> >(tee -i -a {log:q} >&2)"
+        " >> {log:q} 2> >(trap '' HUP INT TERM; exec tee -a {log:q} >&2)"
+
+
+if workflow.is_main_process and workflow.output_settings.dryrun and not CONFIG.allow_missing:
+    from safemr.errors import tell
+    from safemr.forecast import announced
+
+    for line in announced(CONFIG.results_root, PLAN.trained):
+        tell(line)

@@ -1,7 +1,7 @@
 # The final policies on layouts that no run was evaluated on: ten fixed layouts say little of others.
 FLOWN = {}
 for run in (*PLAN.navigation, *PLAN.sensitivity):
-    if run in RECORDED and run.task in ROBOT_TASKS:
+    if run in RECORDED:
         FLOWN.setdefault(run.task, {})[run.path.as_posix()] = run
 
 
@@ -51,6 +51,7 @@ rule unseen_table:
     threads: 1
     params:
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
+        layouts=CONFIG.evaluation.episodes,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
         sources=sources("unseen_table"),

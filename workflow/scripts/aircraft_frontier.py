@@ -6,5 +6,6 @@ from safemr.measurements import Measurements
 
 params = snakemake.params
 with reported_errors():
-    frontier = measured_frontier(Measurements(params.root), TrueSets.cached(params.cache))
+    sets = TrueSets.cached(params.cache, task=params.task)
+    frontier = measured_frontier(Measurements(params.root), sets)
 frontier.to_csv(snakemake.output[0], index=False)

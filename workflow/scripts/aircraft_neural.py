@@ -5,18 +5,16 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from safemr import neural_evidence, reachability, records, statistics
-from safemr.aircraft import COVERS
+from safemr import neural_evidence, reachability, records, reference, statistics
 from safemr.aircraft_evidence import TrueSets
 from safemr.cli import reported_errors
+from safemr.conventions import COVERS
 from safemr.measurements import Measurements
 from safemr.plotting import aircraft, style
 
-PAPER = ("SafeMR", "JointSIS")  # the learners of zeta that stand beside
-
 torch.set_num_threads(1)
 given, params, output = snakemake.input, snakemake.params, snakemake.output
-frontier, reference = pd.read_csv(given.frontier), pd.read_csv(given.comparison)
+frontier, others = pd.read_csv(given.frontier), pd.read_csv(given.comparison)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 root = Path(params.root)
 with reported_errors():
@@ -24,7 +22,7 @@ with reported_errors():
     runs = runs.reindex(columns=runs.columns.union(expected.columns))
     comparison, x, y, cut = neural_evidence.measured(
         Measurements(root),
-        TrueSets.cached(params.cache, neural_evidence.LOG2_STATES),
+        TrueSets.cached(params.cache, neural_evidence.LOG2_STATES, params.task),
         frontier,
         root,
         runs,
@@ -34,7 +32,9 @@ comparison.to_csv(output.comparison, index=False)
 missing = statistics.missing_runs(expected, runs)
 neural_evidence.comparison_table(comparison, missing).write(Path(output.markdown).parent)
 # One seed of each in the slice, every seed on the trade-off, beside the learners of zeta.
-beside = reference[reference["variant"].isin(PAPER) | (reference["kind"] == "certificate")]
+learned = others["variant"].isin(reference.LEARNERS)
+beside = others[learned | (others["kind"] == "certificate")]
 points = pd.concat([beside, comparison[comparison["kind"] != "certificate"]])
-figure = aircraft.neural(x, y, cut, reachability.CONSTANT.d_min, frontier, points, COVERS)
+d_min = reachability.CONSTANT.d_min
+figure = aircraft.neural(x, y, cut, d_min, frontier, points, COVERS)
 style.save(figure, Path(output.pdf).with_suffix(""))

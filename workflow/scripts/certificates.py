@@ -8,30 +8,31 @@ from safemr import certify, reference
 from safemr.cli import reported_errors
 from safemr.measurements import Measurements
 from safemr.plotting import style
+from safemr.tasks import name_of
 
 params, output = snakemake.params, snakemake.output
 measurements = Measurements(params.root)
 rows, examples = [], {}
 with reported_errors():
-    jobs = [(c, certify.DEFAULT_TASK, {}) for c in certify.paper_certificates()]
-    pictured = [job[0] for job in jobs]
-    for folder in params.folders:
-        jobs.append(certify.certificate_of_record(Path(params.root, folder)))
-        if folder in params.pictured and jobs[-1][1] == certify.DEFAULT_TASK:
-            pictured.append(jobs[-1][0])
-    for certificate, task, settings in jobs:
-        row, example = certify.measured_certificate(
-            measurements, certificate, task,
-            states=params.states, episodes=params.episodes, settings=settings,
-        )  # fmt: skip
+    learned = {
+        folder: certify.certificate_of_record(Path(params.root, folder))
+        for folder in params.folders
+    }
+    papers = certify.paper_certificates() if params.paper else []
+    jobs = [(certificate, certify.DEFAULT_TASK) for certificate in papers] + [*learned.values()]
+    for title, (certificate, task) in zip(certify.example_titles(jobs), jobs, strict=True):
+        row, examples[title] = certify.measured_certificate(
+            measurements, certificate, task, states=params.states, episodes=params.episodes
+        )
         rows.append(row)
-        examples[f"{certificate.name} on {task}"] = example
+    chosen = [(certificate, certify.DEFAULT_TASK) for certificate in papers]
+    chosen += [learned[folder] for folder in params.pictured] or jobs[-1:]
     # The map is that of the last one.
-    pictured.sort(key=lambda certificate: certificate.name.partition(" (")[0] == reference.METHOD)
-    mapped = certify.measured_margins(measurements, pictured[-1], certify.DEFAULT_TASK)
-    figure = certify.picture(pictured, *mapped)
+    chosen.sort(key=lambda job: job[0].name.partition(" (")[0] == reference.METHOD)
+    mapped = certify.measured_margins(measurements, *chosen[-1])
+    figure = certify.picture([certificate for certificate, _ in chosen], *mapped)
 table = certify.certificate_table(rows)
-lacking = [f"{job[0].name} on {job[1]}" for job in jobs[5:] if job[0].policy is None]
+lacking = [f"{c.name} on {name_of(task)}" for c, task in learned.values() if c.policy is None]
 if lacking:
     note = f"No policy.npz, parameters from progress.csv: {'; '.join(lacking)}."
     print(note)

@@ -11,6 +11,5 @@ with reported_errors():
         params.tasks,
         seeds=params.seeds,
         episodes=params.episodes,
-        settings=params.settings,
     )
 scores.to_csv(snakemake.output[0], index=False)

@@ -15,23 +15,33 @@ final = pd.read_csv(snakemake.input.scores)
 final = final[final["task"].isin(params.tasks) & final["variant"].isin(params.variants)]
 rule = SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
 scale = {task: reference.TABLE_I[task].safemr for task in params.tasks if task in reference.TABLE_I}
-returns = final[final["metric"] == "eval_return"]
-normalised = np.nan_to_num((returns["value"] / returns["task"].map(scale)).agg(["min", "max"]))
-# To the next half beyond every run's score: a profile that ends earlier hides runs.
-low, high = np.floor(2 * normalised[0]) / 2, np.ceil(2 * normalised[1]) / 2
-thresholds = np.linspace(min(-0.5, low), max(2.0, high), 121)
 pairs = final[["task", "variant"]].drop_duplicates().itertuples(index=False, name=None)
-figures = [
-    drawing.return_against_cost(
+figures = {
+    "return_against_cost": drawing.return_against_cost(
         final,
         params.tasks,
         tolerance=params.tolerance,
         unsafe=[pair for pair in pairs if not rule.is_safe(final, *pair)],
     )
-]
-for chosen, name in ((final, "return"), (rule.safe_returns(final), "safe return")):
-    aggregates = statistics.aggregate(chosen, params.variants, reference.METHOD, scale, thresholds)
-    absent = [variant for variant in params.variants if variant not in aggregates.profiles]
-    figures.append(drawing.aggregate_scores(aggregates, name=name, absent=absent))
-for figure, path in zip(figures, snakemake.output.pdf, strict=True):
-    style.save(figure, Path(path).with_suffix(""))
+}
+if scale:  # the paper's return is the unit
+    returns = final[(final["metric"] == "eval_return") & final["task"].isin(list(scale))]
+    normalised = np.nan_to_num((returns["value"] / returns["task"].map(scale)).agg(["min", "max"]))
+    # To the next half beyond every run's score: a profile that ends earlier hides runs.
+    low, high = np.floor(2 * normalised[0]) / 2, np.ceil(2 * normalised[1]) / 2
+    thresholds = np.linspace(min(-0.5, low), max(2.0, high), 121)
+    for chosen, file, name in (
+        (final, "aggregate_scores", "return"),
+        (rule.safe_returns(final), "aggregate_safe_scores", "safe return"),
+    ):
+        aggregates = statistics.aggregate(
+            chosen, params.variants, reference.METHOD, scale, thresholds
+        )
+        figures[file] = drawing.aggregate_scores(
+            aggregates,
+            name=name,
+            absent=[variant for variant in params.variants if variant not in aggregates.profiles],
+            tasks=() if len(scale) == len(params.tasks) else tuple(scale),
+        )
+for path in map(Path, snakemake.output.pdf):
+    style.save(figures[path.stem], path.with_suffix(""))

@@ -6,16 +6,16 @@ from envs.drawing import draw_scene
 from safemr import certify, reference
 from safemr.falsification import make_simulator
 from safemr.plotting import certificate, scenes, style
+from safemr.tasks import name_of
 
 learned = reference.TABLE_II[reference.HEADLINE]
 d_min = float(make_simulator(certify.DEFAULT_TASK, 1).d_min)
-layouts = {task: make_simulator(task, 1).scene(0) for task in snakemake.params.tasks}
-figures = (
-    certificate.energy_and_safe_set(learned, d_min),
-    certificate.narrow_passage(
-        (r"handcrafted $\phi_h$", reference.PHI_H), ("learned by SafeMR (paper)", learned), d_min
-    ),
-    scenes.environments(layouts, draw_scene),
-)
-for figure, path in zip(figures, snakemake.output.pdf, strict=True):
-    style.save(figure, Path(path).with_suffix(""))
+pair = ((r"handcrafted $\phi_h$", reference.PHI_H), ("learned by SafeMR (paper)", learned))
+layouts = {name_of(task): make_simulator(task, 1).scene(0) for task in snakemake.params.tasks}
+drawn = {
+    "energy_and_safe_set": lambda: certificate.energy_and_safe_set(learned, d_min),
+    "narrow_passage": lambda: certificate.narrow_passage(*pair, d_min),
+    "environments": lambda: scenes.environments(layouts, draw_scene),
+}
+for path in map(Path, snakemake.output.pdf):
+    style.save(drawn[path.stem](), path.with_suffix(""))

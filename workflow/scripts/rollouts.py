@@ -8,18 +8,17 @@ from safemr.cli import reported_errors
 from safemr.measurements import Measurements
 from safemr.plotting import data
 
-params, task = snakemake.params, snakemake.wildcards.task
+params = snakemake.params
 measurements = Measurements(params.root)
 arrays = {}
 with reported_errors():
     for variant, folder in params.folders.items():
-        certificate, _, settings = certificate_of_record(Path(params.root, folder))
+        certificate, entry = certificate_of_record(Path(params.root, folder))
         if certificate.policy is None:
             print(f"no policy in {folder}")
             continue
         made = rollouts.measured(
-            measurements, certificate, task,
-            layouts=params.layouts, steps=params.steps, settings=settings,
-        )  # fmt: skip
+            measurements, certificate, entry, layouts=params.layouts, steps=params.steps
+        )
         arrays |= {f"{variant}/{name}": values for name, values in made.items()}
 data.save(snakemake.output[0], arrays)

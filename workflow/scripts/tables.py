@@ -18,11 +18,11 @@ made = [
     tables.table_one(
         learned, missing=missing, rule=rule, tasks=params.tasks, baselines=params.baselines
     ),
-    tables.full_results(scores, missing=missing, rule=rule),
+    tables.full_results(scores, missing=missing, rule=rule, layouts=params.layouts),
     comparisons.differences(learned, missing=missing),
     tables.compute(runs),
 ]
 if params.push:
-    made.append(tables.push_split(scores, missing=missing))
+    made.append(tables.push_split(scores, params.push, missing=missing))
 for table in made:
     table.write(Path(snakemake.output.table[0]).parent)

@@ -12,6 +12,7 @@ table = unseen.table(
     flown,
     pd.read_csv(snakemake.input.scores),
     episodes=params.episodes,
+    layouts=params.layouts,
     rule=tables.SafetyRule(params.tolerance, params.clean_share),
 )
 source = f"{params.episodes} unseen layouts"

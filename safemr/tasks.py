@@ -1,0 +1,88 @@
+"""What a task is to the pipeline: its name, its environment, and what that environment has.
+
+A run's config says its task as a mapping: ``name``, ``version``, ``settings`` and, where the name
+is not a registered one, ``base``, the registered task that the settings change. A task with other
+settings is another task and has its own name, so that what is said of a name (the paper's values,
+its claims) never meets numbers of something else. Whoever needs an environment of a run asks
+`make_envs`; whether a drawing, a check or a controller makes sense for a task, its `Traits` say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+# The ``task`` entry of a run's config (`safemr.runs.describe_task`), or the name of a registered
+# task, which then has its own settings.
+Task: TypeAlias = "str | Mapping[str, Any]"
+
+# Settings of how a task is simulated, not of what it is: they make no other task of it.
+SIMULATION = ("sleep",)
+
+
+@dataclass(frozen=True)
+class Traits:
+    """What the environment of a task has; a new kind of task answers here and nowhere else."""
+
+    point_robot: bool  # of which `safemr.point_robot` is a model; its scenes can be drawn
+    pushes_box: bool
+    action_dim: int
+    episode_steps: int | None  # the most steps of an episode, where the environment says so
+
+
+@dataclass(frozen=True)
+class Described:
+    """A task of a plan: its entry in the config of its runs, and its traits."""
+
+    entry: Mapping[str, Any]
+    traits: Traits
+
+
+def name_of(task: Task) -> str:
+    """What the task is called in tables and folders."""
+    return task if isinstance(task, str) else str(task["name"])
+
+
+def base_of(task: Task) -> str:
+    """The registered task behind it."""
+    return task if isinstance(task, str) else str(task.get("base", task["name"]))
+
+
+def settings_of(task: Task) -> dict[str, Any]:
+    """The keyword arguments of its environment."""
+    return {} if isinstance(task, str) else dict(task.get("settings", {}))
+
+
+def task_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of some settings that make another task of the registered one."""
+    return {name: value for name, value in settings.items() if name not in SIMULATION}
+
+
+def make_envs(task: Task, num_envs: int) -> Any:
+    """A batched environment of a task."""
+    import gymnasium
+
+    return gymnasium.make_vec(
+        f"envs:{base_of(task)}-v0",
+        num_envs,
+        vectorization_mode="vector_entry_point",
+        **settings_of(task),
+    )
+
+
+def traits(environment: Any) -> Traits:
+    """What an environment, scalar or batched, has."""
+    task = getattr(environment, "task", None)
+    return Traits(
+        point_robot="velocimeter" in getattr(environment, "observation_layout", ()),
+        pushes_box=bool(getattr(task, "has_box", False)),
+        action_dim=math.prod(_action_space(environment).shape),
+        episode_steps=getattr(environment, "max_episode_steps", None),
+    )
+
+
+def _action_space(environment: Any) -> Any:
+    """That of one environment, also where there is a batch."""
+    return getattr(environment, "single_action_space", environment.action_space)
