@@ -21,10 +21,10 @@ from envs.compiled import njit
 
 # Numba keeps compiled code until this file changes, and constants are part of it: what comes from
 # another module is therefore written out here and compared.
-LIDAR_BINS = 16
-if LIDAR_BINS != tasks.LIDAR_BINS:
+_LIDAR_BINS = 16
+if _LIDAR_BINS != tasks.LIDAR_BINS:
     raise ImportError("envs/navigation_kernels.py and envs/tasks.py state different LIDAR_BINS")
-BIN_WIDTH = 2 * math.pi / LIDAR_BINS
+BIN_WIDTH = 2 * math.pi / _LIDAR_BINS
 GRAVITY = 9.81
 MAGNETIC_FIELD = 0.5  # along world -y
 ROBOT_Z, GOAL_Z = 0.1, 0.16  # m, heights of the body origins
@@ -202,13 +202,13 @@ def _add_to_lidar(bins, pose, c, s, x, y, lidar_range):
     angle = math.atan2(c * dy - s * dx, c * dx + s * dy) % (2 * math.pi)
     position = angle / BIN_WIDTH
     fraction = position - math.floor(position)
-    index = int(position) % LIDAR_BINS
+    index = int(position) % _LIDAR_BINS
     distance = math.sqrt(dx * dx + dy * dy)
     if lidar_range < math.inf:
         signal = max(0.0, lidar_range - distance) / lidar_range
     else:
         signal = math.exp(-distance)
-    after, before = (index + 1) % LIDAR_BINS, (index - 1) % LIDAR_BINS
+    after, before = (index + 1) % _LIDAR_BINS, (index - 1) % _LIDAR_BINS
     bins[index] = max(bins[index], signal)
     bins[after] = max(bins[after], fraction * signal)
     bins[before] = max(bins[before], (1.0 - fraction) * signal)
@@ -233,14 +233,14 @@ def observe(pose, qpos, qvel, qacc, obstacles, goal, blocks, lidar_range, observ
         c, s = math.cos(pose[i, 2]), math.sin(pose[i, 2])
         out[blocks[2]] = -MAGNETIC_FIELD * s
         out[blocks[2] + 1] = -MAGNETIC_FIELD * c
-        bins = out[blocks[4] : blocks[4] + LIDAR_BINS]
+        bins = out[blocks[4] : blocks[4] + _LIDAR_BINS]
         _add_to_lidar(bins, pose[i], c, s, goal[i, 0], goal[i, 1], lidar_range)
-        bins = out[blocks[5] : blocks[5] + LIDAR_BINS]
+        bins = out[blocks[5] : blocks[5] + _LIDAR_BINS]
         for j in range(obstacles.shape[1]):
             x, y = obstacles[i, j, 0], obstacles[i, j, 1]
             _add_to_lidar(bins, pose[i], c, s, x, y, lidar_range)
         if blocks[6] >= 0:
-            bins = out[blocks[6] : blocks[6] + LIDAR_BINS]
+            bins = out[blocks[6] : blocks[6] + _LIDAR_BINS]
             _add_to_lidar(bins, pose[i], c, s, qpos[i, 3], qpos[i, 4], lidar_range)
 
 

@@ -74,33 +74,30 @@ class Again:
 def the_controllers(again: Again) -> None:
     inputs = again.kept("controllers", TASK)[1]["inputs"]
     controllers.measured_scores(
-        again.measurements, [TASK], seeds=inputs["seeds"], episodes=inputs["episodes"],
-        settings={TASK: inputs["task"]["settings"]},
-    )  # fmt: skip
+        again.measurements, [inputs["task"]], seeds=inputs["seeds"], episodes=inputs["episodes"]
+    )
 
 
 def a_learned_certificate(again: Again) -> None:
     inputs = again.kept("certificates", f"{TASK}-SafeMR-seed*")[1]["inputs"]
-    certificate, task, settings = certify.certificate_of_record(again.record(inputs["policy"]))
+    certificate, task = certify.certificate_of_record(again.record(inputs["policy"]))
     certify.measured_certificate(
-        again.measurements, certificate, task, states=inputs["states"],
-        episodes=inputs["episodes"], settings=settings,
-    )  # fmt: skip
+        again.measurements, certificate, task, states=inputs["states"], episodes=inputs["episodes"]
+    )
 
 
 def the_margins(again: Again) -> None:
     inputs = again.kept("certificates", f"{TASK}-SafeMR-seed*")[1]["inputs"]
-    certificate, task, _ = certify.certificate_of_record(again.record(inputs["policy"]))
+    certificate, task = certify.certificate_of_record(again.record(inputs["policy"]))
     certify.measured_margins(again.measurements, certificate, task)
 
 
 def the_rollouts(again: Again) -> None:
     inputs = again.kept("rollouts", f"{TASK}-SafeMR-seed*")[1]["inputs"]
-    certificate, task, settings = certify.certificate_of_record(again.record(inputs["policy"]))
+    certificate, task = certify.certificate_of_record(again.record(inputs["policy"]))
     rollouts.measured(
-        again.measurements, certificate, task, layouts=inputs["layouts"], steps=inputs["steps"],
-        settings=settings,
-    )  # fmt: skip
+        again.measurements, certificate, task, layouts=inputs["layouts"], steps=inputs["steps"]
+    )
 
 
 def unseen_layouts(again: Again) -> None:
@@ -130,8 +127,14 @@ def the_slices(again: Again) -> None:
 
 
 def neural_energies(again: Again) -> None:
-    inputs = again.kept("aircraft_neural", "neural")[1]["inputs"]
-    folders = [again.record(policy) for policy in inputs["policies"]]
+    entry = again.kept("aircraft_neural", "neural")[1]
+    inputs, order = entry["inputs"], [(row["variant"], row["seed"]) for row in entry["value"]]
+
+    def place(folder: Path) -> int:
+        """Of a record among the rows, which are in the order of the configuration."""
+        return order.index((folder.parts[-2], int(folder.name.partition("-")[0][len("seed") :])))
+
+    folders = sorted((again.record(policy) for policy in inputs["policies"]), key=place)
     runs, _ = records.read_records(again.root, [f.relative_to(again.root) for f in folders])
     config = json.loads((folders[0] / records.CONFIG).read_text())
     neural_evidence.measured(
