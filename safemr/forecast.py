@@ -29,13 +29,11 @@ def announced(root: Path, runs: Sequence[Run]) -> list[str]:
     seconds = [_estimate(run, known) for run in missing]
     estimated = sum(value for value in seconds if value is not None)
     unknown = sum(value is None for value in seconds)
-    time = (
-        f"about {_time(estimated)} by the records here"
-        if estimated
-        else "no record to tell how long"
-    )
-    if estimated and unknown:
-        time += f", and {unknown} of which none tells how long"
+    time = f"about {_time(estimated)} by the records here"
+    if unknown:
+        time = "for how long no record tells"
+        if estimated:
+            time = f"about {_time(estimated)} and {_count(unknown, 'run')} of unknown length"
     lines = [f"To be trained: {_count(len(missing), 'run')}, {time}"]
     for variant in dict.fromkeys(run.variant for run in missing):
         counts: dict[str, int] = {}

@@ -31,27 +31,34 @@ OTHER: dict[str, list[Any]] = {
     **{"multiplier_cap": [0.01], "multiplier_grad_norm": [1e-4], "constraint_floor": [-0.5]},
     **{"eta": [0.5], "gamma": [0.5], "policy_delay": [1], "lr_final": [0.9], "a": [0.1]},
     **{"num_envs": [8, 2], "multiplier_delay": [8], "updates_together": [2]},
-    **{"sigma_min": [0.3], "k_min": [1.0], "n_min": [2.0], "n_max": [2.0]},
+    **{"sigma_min": [0.3], "k_min": [1.0], "certificate_start": [0.5]},
     **{"cost_rate_limit": [0.5], "cost_limit": [10.0], "kl_stop": [0.01], "clip": [0.01]},
     **{"target_kl": [1e-4, 1.0], "cost_tolerance": [10.0], "backtrack_iterations": [1]},
     **{"multiplier_initial": [9.0], "policy_passes": [1], "policy_batch": [50]},
-    **{"backtrack_factor": [0.1], "epoch_steps": [400]},
+    **{"backtrack_factor": [0.1], "epoch_steps": [400], "conjugate_gradient_iterations": [1]},
 }
 # What needs other settings to be felt.
 BESIDE: dict[str, dict[str, Any]] = {
     "backtrack_factor": {"target_kl": 1.0},  # the line search has to refuse a step
     "backtrack_iterations": {"target_kl": 1.0},
+    "target_kl": {"policy_lr": 0.01},  # PPO has to reach the bound
+    "kl_stop": {"policy_lr": 0.01},
+    "certificate_derivative": {"sigma": 1.0},  # the point has to enter the unsafe set
 }
-# No loss can raise sigma, and k rises seldom: these bounds act on the start of zeta.
-BOUNDS_OF_THE_START = ("sigma_max", "k_max")
+# No loss can raise sigma, and k and n move little: these bounds of the box refuse a start beyond.
+BOUNDS_OF_THE_START = {"sigma_max": 0.2, "k_max": 0.2, "n_min": 3.0, "n_max": 0.2}
 ELSEWHERE = ("device",)  # says where the numbers are made, not which
+
+
+def small(algorithm: catalogue.Algorithm) -> dict[str, Any]:
+    """The settings of a short run that an algorithm has."""
+    names = {field.name for field in dataclasses.fields(algorithm.hyperparameters)}
+    return {k: v for k, v in SMALL[algorithm.family].items() if k in names}
 
 
 def trained(algorithm: catalogue.Algorithm, values: dict[str, Any]) -> torch.Tensor:
     """The policy's parameters after a short training on the toy task, unchecked values allowed."""
-    names = {field.name for field in dataclasses.fields(algorithm.hyperparameters)}
-    small = {k: v for k, v in SMALL[algorithm.family].items() if k in names}
-    config = algorithm.hyperparameters(**small)
+    config = algorithm.hyperparameters(**small(algorithm))
     for name, value in values.items():
         object.__setattr__(config, name, value)
     trainer = algorithm.trainer(config, ToyEnvs, 0, STEPS)
@@ -74,7 +81,7 @@ def candidates(algorithm: catalogue.Algorithm, name: str) -> list[Any]:
 
 def accepted(algorithm: catalogue.Algorithm, values: dict[str, Any]) -> bool:
     with contextlib.suppress(UserError):
-        catalogue.hyperparameters(algorithm, values, "test")
+        catalogue.hyperparameters(algorithm, small(algorithm) | values, "test")
         return True
     return False
 
@@ -126,9 +133,9 @@ def test_what_is_declared_unused_is_so_and_cannot_be_set(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["joint_sis", "safemr"])
 def test_the_box_refuses_a_start_outside(name: str) -> None:
-    for bound in BOUNDS_OF_THE_START:
-        with pytest.raises(UserError, match=bound.removesuffix("_max")):
-            runs.load_algorithm(name).hyperparameters(**{bound: 0.2})
+    for bound, value in BOUNDS_OF_THE_START.items():
+        with pytest.raises(UserError, match=rf"^{bound.partition('_')[0]} = "):
+            runs.load_algorithm(name).hyperparameters(**{bound: value})
 
 
 @pytest.mark.parametrize(
