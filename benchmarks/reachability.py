@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from safemr.aircraft import Truth
-from safemr.reachability import CASES, Grid, Solution, solve
-from safemr.reachability.barrier import boundary_error, sheets
-from safemr.reachability.check import compare, intersection_over_union, read_references
+from safemr.aircraft.reachability import CASES, Grid, Solution, solve
+from safemr.aircraft.reachability.barrier import boundary_error, sheets
+from safemr.aircraft.reachability.check import compare, intersection_over_union, read_references
+from safemr.aircraft.unsafe_sets import Truth
 
 SHAPES = ((66, 66, 48), (131, 131, 96), (197, 197, 120), (261, 261, 144), (391, 391, 240))
 SLICES = Path(__file__).parents[1] / "tests" / "golden" / "aircraft" / "slices.npz"

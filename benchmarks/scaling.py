@@ -21,7 +21,7 @@ from statistics import median
 from typing import Any
 
 from benchmarks.training import Run
-from safemr.plotting import style
+from safemr.report.figures import style
 
 TASK, HELD = "Pillars-0.15-Goal", 150_000
 COLUMNS = ("factor", "value", "ms", "relative")

@@ -35,9 +35,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.environments import raw_rate
 from envs.navigation_batch import NavigationBatch
 from envs.tasks import NAVIGATION_TASKS
-from safemr.evaluate import evaluate
-from safemr.runs import load_algorithm
-from safemr.train import make_envs
+from safemr.experiment.planning import load_algorithm
+from safemr.experiment.train import make_envs
+from safemr.learning.evaluation import evaluate
 
 OFF_POLICY = ("safemr", "joint_sis", "fac", "sac_lagrangian")
 ON_POLICY = ("ppo_lagrangian", "trpo_lagrangian", "cpo")

@@ -1,8 +1,8 @@
 """The ``safemr`` command: one name for the programs of this package.
 
-safemr train ...      train one run (`python -m safemr.train`)
-safemr evaluate ...   evaluate a recorded policy (`python -m safemr.evaluate`)
-safemr certify ...    check a learned energy function (`python -m safemr.certify`)
+safemr train ...      train one run (`python -m safemr.experiment.train`)
+safemr evaluate ...   evaluate a recorded policy (`python -m safemr.learning.evaluation`)
+safemr certify ...    check a learned energy function (`python -m safemr.measure.certify`)
 safemr records ...    verify the records under a results root and say what is unfinished
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
@@ -21,12 +21,12 @@ from safemr.names import unknown
 
 # Command -> module with main(arguments) -> exit status, imported only when it is called.
 COMMANDS = {
-    "train": "safemr.train",
-    "evaluate": "safemr.evaluate",
-    "certify": "safemr.certify",
-    "records": "safemr.inspection",
-    "list": "safemr.listing",
-    "config": "safemr.config",
+    "train": "safemr.experiment.train",
+    "evaluate": "safemr.learning.evaluation",
+    "certify": "safemr.measure.certify",
+    "records": "safemr.experiment.overview",
+    "list": "safemr.experiment.listing",
+    "config": "safemr.experiment.config",
 }
 
 

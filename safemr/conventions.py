@@ -1,6 +1,6 @@
 """Numbers that this reproduction chose and that more than one part uses, each written once."""
 
-# When an algorithm counts as safe on a task (`safemr.tables.SafetyRule`, `safe` in the
+# When an algorithm counts as safe on a task (`safemr.report.tables.SafetyRule`, `safe` in the
 # configuration): mean violating steps an episode at most, mean share of clean episodes at least.
 COST_TOLERANCE = 1.0
 CLEAN_SHARE = 0.95

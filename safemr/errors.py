@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from typing import TextIO
+from typing import Any, TextIO
 
 
 class UserError(Exception):
@@ -23,3 +23,9 @@ def tell(message: str, stream: TextIO | None = None, *, end: str = "\n") -> None
     """
     with contextlib.suppress(OSError):
         print(message, file=stream or sys.stderr, end=end, flush=True)
+
+
+def show(value: Any) -> str:
+    """A short one-line picture of any value for an error message."""
+    text = ascii(value)
+    return text if len(text) <= 80 else text[:77] + "..."

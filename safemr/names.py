@@ -7,8 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
-from safemr.errors import UserError
-from safemr.strict_yaml import show
+from safemr.errors import UserError, show
 
 
 def unknown(kind: str, name: Any, known: Iterable[str], where: str = "") -> UserError:

@@ -16,8 +16,8 @@ from typing import Any, TypeAlias
 
 from safemr.environments import register_tasks
 
-# The ``task`` entry of a run's config (`safemr.runs.describe_task`), or the name of a registered
-# task, which then has its own settings.
+# The ``task`` entry of a run's config (`safemr.experiment.planning.describe_task`), or the name of
+# a registered task, which then has its own settings.
 Task: TypeAlias = "str | Mapping[str, Any]"
 
 # Settings of how a task is simulated, not of what it is: they make no other task of it.
@@ -28,7 +28,9 @@ SIMULATION = ("sleep",)
 class Traits:
     """What the environment of a task has; a new kind of task answers here and nowhere else."""
 
-    point_robot: bool  # of which `safemr.point_robot` is a model; its scenes can be drawn
+    point_robot: (
+        bool  # of which `safemr.certificates.point_robot` is a model; its scenes can be drawn
+    )
     pushes_box: bool
     action_dim: int
     episode_steps: int | None  # the most steps of an episode, where the environment says so

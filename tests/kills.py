@@ -29,9 +29,9 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
-from safemr import checkpoints, records, runs  # noqa: E402
-from safemr.checkpoints import RunSession  # noqa: E402
-from safemr.train import train  # noqa: E402
+from safemr.experiment import checkpoints, planning, records  # noqa: E402
+from safemr.experiment.checkpoints import RunSession  # noqa: E402
+from safemr.experiment.train import train  # noqa: E402
 
 Outcome = tuple[list[dict[str, str]], bytes]
 
@@ -52,22 +52,22 @@ LOG_POINTS = 12  # in each of them
 
 def short_run(
     name: str, task: str = "Pillars-0.15-Goal", overrides: dict[str, Any] | None = None
-) -> runs.Run:
+) -> planning.Run:
     """A run of an algorithm with its default networks, ``overrides`` apart."""
-    algorithm = runs.load_algorithm(name)
+    algorithm = planning.load_algorithm(name)
     short, steps = SHORT[algorithm.family]
     return make_run(name, task, {**short, **(overrides or {})}, steps, LOG_POINTS, LOG_POINTS // 4)
 
 
 def make_run(
     name: str, task: str, overrides: dict[str, Any], steps: int, points: int, evaluations: int
-) -> runs.Run:
+) -> planning.Run:
     """A run with ``points`` rows, of which ``evaluations`` are of an evaluated policy."""
-    algorithm = runs.load_algorithm(name)
-    return runs.make_run(
-        runs.describe_task(task, SETTINGS.get(task, {})),
+    algorithm = planning.load_algorithm(name)
+    return planning.make_run(
+        planning.describe_task(task, SETTINGS.get(task, {})),
         algorithm,
-        runs.hyperparameters(algorithm, overrides, name),
+        planning.hyperparameters(algorithm, overrides, name),
         variant=name,
         seed=100,
         steps=steps,
@@ -76,7 +76,7 @@ def make_run(
     )
 
 
-def attempt(run: runs.Run, root: Path, saved: int | None = None) -> int:
+def attempt(run: planning.Run, root: Path, saved: int | None = None) -> int:
     """Train in a forked process, which need not import anything; returns its process id.
 
     ``saved``: a descriptor to which the process writes each checkpoint's step when it is durably
@@ -106,7 +106,7 @@ def attempt(run: runs.Run, root: Path, saved: int | None = None) -> int:
         os._exit(status)
 
 
-def outcome(run: runs.Run, root: Path) -> Outcome:
+def outcome(run: planning.Run, root: Path) -> Outcome:
     """Progress without the time columns, and the policy file."""
     folder = root / run.path
     records.verify_record(folder)
@@ -115,13 +115,13 @@ def outcome(run: runs.Run, root: Path) -> Outcome:
     return kept, (folder / "policy.npz").read_bytes()
 
 
-def starts(run: runs.Run, root: Path) -> list[int]:
+def starts(run: planning.Run, root: Path) -> list[int]:
     """The step from which each attempt at a finished run went on."""
     provenance = json.loads((root / run.path / "provenance.json").read_text())
     return [event["step"] for event in provenance["attempts"] if "step" in event]
 
 
-def finish(run: runs.Run, root: Path) -> Outcome:
+def finish(run: planning.Run, root: Path) -> Outcome:
     """Train without an interruption, from the checkpoint if there is one."""
     _, status = os.waitpid(attempt(run, root), 0)
     assert status == 0
@@ -129,7 +129,7 @@ def finish(run: runs.Run, root: Path) -> Outcome:
 
 
 def kill_after(
-    run: runs.Run, root: Path, step: int, delay: float, number: int = signal.SIGKILL
+    run: planning.Run, root: Path, step: int, delay: float, number: int = signal.SIGKILL
 ) -> int:
     """Start or continue a run and kill it ``delay`` seconds after a checkpoint at ``step`` or
     later is on the disk. Returns the step of the last checkpoint that it told of."""
@@ -152,7 +152,7 @@ def kill_after(
     return told
 
 
-def killed(run: runs.Run, root: Path, steps: Sequence[int], delays: Sequence[float]) -> Outcome:
+def killed(run: planning.Run, root: Path, steps: Sequence[int], delays: Sequence[float]) -> Outcome:
     """Kill a run after checkpoints at ``steps``, then let it finish; every attempt but the first
     must have gone on from a checkpoint."""
     expected = [0]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from safemr import records
+from safemr.experiment import records
 
 CONFIG: dict[str, Any] = {
     "schema": 1,

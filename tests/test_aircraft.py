@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import envs  # noqa: F401  registers the environments
 from envs.aircraft import AircraftDynamics, AircraftEnv, AircraftVectorEnv, outside_box
-from safemr import aircraft
-from safemr.energy import in_metres
-from safemr.reachability import CONSTANT, Grid, Solution, solve
+from safemr.aircraft import unsafe_sets
+from safemr.aircraft.reachability import CONSTANT, Grid, Solution, solve
+from safemr.certificates.energy import in_metres
 
 DYNAMICS = AircraftDynamics()
 RATES = st.floats(-1.0, 1.0)
@@ -165,11 +165,11 @@ def solution() -> Solution:
 
 
 @pytest.fixture(scope="module")
-def truth(solution: Solution) -> aircraft.Truth:
-    return aircraft.Truth.sample(solution, log2_count=16)
+def truth(solution: Solution) -> unsafe_sets.Truth:
+    return unsafe_sets.Truth.sample(solution, log2_count=16)
 
 
-def test_volume_of_the_true_set_and_of_the_disc(truth: aircraft.Truth):
+def test_volume_of_the_true_set_and_of_the_disc(truth: unsafe_sets.Truth):
     assert truth.volume == pytest.approx(721.5, rel=0.003)
     assert truth.domain * truth.disc.mean() == pytest.approx(25 * np.pi * 2 * np.pi, rel=0.001)
 
@@ -186,7 +186,7 @@ def test_volume_of_the_true_set_and_of_the_disc(truth: aircraft.Truth):
     ],
 )
 def test_known_certificates(
-    truth: aircraft.Truth,
+    truth: unsafe_sets.Truth,
     zeta: tuple[float, float, float],
     ratio: float,
     iou: float,
@@ -195,7 +195,7 @@ def test_known_certificates(
     infeasible_eta: float,
     leak: float,
 ):
-    metrics = aircraft.compare_certificate(truth, aircraft.energy_certificate(CONSTANT, zeta))
+    metrics = unsafe_sets.compare_certificate(truth, unsafe_sets.energy_certificate(CONSTANT, zeta))
     assert metrics.volume_ratio == pytest.approx(ratio, abs=0.02)
     assert metrics.iou == pytest.approx(iou, abs=0.008)
     assert metrics.missed_share == pytest.approx(missed, abs=0.015)
@@ -205,12 +205,12 @@ def test_known_certificates(
     assert metrics.covers == (missed == 0.0)
 
 
-def test_the_truth_is_a_perfect_certificate_of_itself(truth: aircraft.Truth, solution: Solution):
+def test_the_truth_is_a_perfect_certificate_of_itself(truth: unsafe_sets.Truth, solution: Solution):
     def value_certificate(states: np.ndarray) -> np.ndarray:
         inside = np.clip(states[..., :2], [-6, -13], [20, 13])
         return -solution(np.concatenate([inside, states[..., 2:]], axis=-1))
 
-    metrics = aircraft.compare_certificate(truth, value_certificate)
+    metrics = unsafe_sets.compare_certificate(truth, value_certificate)
     assert metrics.volume_ratio == pytest.approx(1.0, abs=1e-3)
     assert metrics.iou == pytest.approx(1.0, abs=1e-3)
     assert metrics.missed_share == 0.0
@@ -222,34 +222,34 @@ def test_the_truth_is_a_perfect_certificate_of_itself(truth: aircraft.Truth, sol
     ("box", "missed", "published", "better"),
     [
         # Full cover is an extreme value: it grows with the number of sampled states.
-        (aircraft.WIDE_BOX, 0.0, 1.89, 0.08),
-        (aircraft.WIDE_BOX, 0.01, 1.65, 0.02),
-        (aircraft.WIDE_BOX, 0.05, 1.42, 0.02),
-        (aircraft.JOINT_SIS_BOX, 0.0, 1.97, 0.08),
-        (aircraft.JOINT_SIS_BOX, 0.01, 1.66, 0.02),
+        (unsafe_sets.WIDE_BOX, 0.0, 1.89, 0.08),
+        (unsafe_sets.WIDE_BOX, 0.01, 1.65, 0.02),
+        (unsafe_sets.WIDE_BOX, 0.05, 1.42, 0.02),
+        (unsafe_sets.JOINT_SIS_BOX, 0.0, 1.97, 0.08),
+        (unsafe_sets.JOINT_SIS_BOX, 0.01, 1.66, 0.02),
     ],
 )
 def test_frontier_is_at_least_as_good_as_a_random_search(
-    truth: aircraft.Truth,
-    box: aircraft.ParameterBox,
+    truth: unsafe_sets.Truth,
+    box: unsafe_sets.ParameterBox,
     missed: float,
     published: float,
     better: float,
 ):
-    (point,) = aircraft.frontier(truth, [missed], box)
+    (point,) = unsafe_sets.frontier(truth, [missed], box)
     assert published - better <= point.volume_ratio <= published + 0.01
-    metrics = aircraft.compare_certificate(
-        truth, aircraft.energy_certificate(CONSTANT, point.zeta), turns=1
+    metrics = unsafe_sets.compare_certificate(
+        truth, unsafe_sets.energy_certificate(CONSTANT, point.zeta), turns=1
     )
     assert metrics.volume_ratio == pytest.approx(point.volume_ratio, abs=1e-3)
     assert metrics.missed_share <= missed + 1e-3
 
 
-def test_frontier_is_not_beaten_by_random_parameters(truth: aircraft.Truth):
+def test_frontier_is_not_beaten_by_random_parameters(truth: unsafe_sets.Truth):
     """Against the definition: random zeta, each judged by its own volume and missed share."""
-    generator, box = np.random.default_rng(0), aircraft.WIDE_BOX
+    generator, box = np.random.default_rng(0), unsafe_sets.WIDE_BOX
     shares = np.array([0.02, 0.05, 0.2])
-    least = [point.volume_ratio for point in aircraft.frontier(truth, shares, box)]
+    least = [point.volume_ratio for point in unsafe_sets.frontier(truth, shares, box)]
     found = np.full(len(shares), np.inf)
     for _ in range(300):
         zeta = (
@@ -257,7 +257,7 @@ def test_frontier_is_not_beaten_by_random_parameters(truth: aircraft.Truth):
             np.exp(generator.uniform(*np.log(box.k))),
             generator.uniform(*box.n),
         )
-        claimed = (aircraft.energy_certificate(CONSTANT, zeta)(truth.states) > 0) | truth.disc
+        claimed = (unsafe_sets.energy_certificate(CONSTANT, zeta)(truth.states) > 0) | truth.disc
         missed = np.mean(~claimed[truth.unsafe & ~truth.disc])
         ratio = claimed.sum() / truth.unsafe.sum()
         found = np.where(missed <= shares, np.minimum(found, ratio), found)
@@ -265,9 +265,9 @@ def test_frontier_is_not_beaten_by_random_parameters(truth: aircraft.Truth):
     assert np.isfinite(found).all()
 
 
-def test_frontier_says_when_the_box_cannot_cover(truth: aircraft.Truth):
-    box = aircraft.ParameterBox(sigma=(0.0, 0.1), k=(0.01, 0.02), n=(1.0, 1.1))
-    impossible, possible = aircraft.frontier(truth, [0.0, 1.0], box)
+def test_frontier_says_when_the_box_cannot_cover(truth: unsafe_sets.Truth):
+    box = unsafe_sets.ParameterBox(sigma=(0.0, 0.1), k=(0.01, 0.02), n=(1.0, 1.1))
+    impossible, possible = unsafe_sets.frontier(truth, [0.0, 1.0], box)
     assert impossible.volume_ratio == np.inf
     assert possible.volume_ratio < 1.0
 
@@ -284,7 +284,7 @@ def test_no_energy_function_is_feasible_dead_ahead(
     d: float, psi: float, k: float, n: float, a: float
 ):
     """On y = 0 phi rises at a rate in which the turn rate does not appear."""
-    phi = aircraft.energy_certificate(CONSTANT, (0.3, k, n))
+    phi = unsafe_sets.energy_certificate(CONSTANT, (0.3, k, n))
     state, h = np.array([d, 0.0, psi]), 1e-6
     rise = (phi(CONSTANT.flow(state, a, 1.0, h)) - phi(CONSTANT.flow(state, a, 1.0, -h))) / (2 * h)
     expected = 5 * n * d ** (n - 1) * (1 - np.cos(psi))
@@ -299,8 +299,8 @@ def test_zeta_in_other_length_units_means_the_same_set(
     sigma: float, k: float, n: float, length: float
 ):
     states = np.random.default_rng(0).uniform([-6, -10, 0], [20, 10, 6.28], (500, 3))
-    scaled = aircraft.energy_certificate(CONSTANT, (sigma, k, n), length)(states)
-    metres = aircraft.energy_certificate(CONSTANT, in_metres((sigma, k, n), length))(states)
+    scaled = unsafe_sets.energy_certificate(CONSTANT, (sigma, k, n), length)(states)
+    metres = unsafe_sets.energy_certificate(CONSTANT, in_metres((sigma, k, n), length))(states)
     np.testing.assert_allclose(scaled * length**n, metres, rtol=1e-9, atol=1e-9)
 
 
@@ -310,10 +310,10 @@ class Straight:
 
 
 def test_optimal_feedback_is_safe_where_straight_flight_is_not(solution: Solution):
-    starts = aircraft.safe_starts(solution, 1500, seed=0, margin=0.05)
+    starts = unsafe_sets.safe_starts(solution, 1500, seed=0, margin=0.05)
     assert (solution(starts) > 0.05).all()
-    straight = aircraft.fly(Straight(), starts, CONSTANT)
-    optimal = aircraft.fly(aircraft.OptimalEvader(solution), starts, CONSTANT)
+    straight = unsafe_sets.fly(Straight(), starts, CONSTANT)
+    optimal = unsafe_sets.fly(unsafe_sets.OptimalEvader(solution), starts, CONSTANT)
     assert straight.summary()["collision_share"] > 0.2
     assert straight.summary()["effort"] == 0.0
     assert not optimal.collided.any()
@@ -324,7 +324,7 @@ def test_optimal_feedback_is_safe_where_straight_flight_is_not(solution: Solutio
 
 def test_flights_report_each_start(solution: Solution):
     starts = np.array([[5.5, 0.0, np.pi], [-5.9, 0.0, np.pi / 2], [8.0, 0.0, np.pi]])
-    flights = aircraft.fly(Straight(), starts, CONSTANT)
+    flights = unsafe_sets.fly(Straight(), starts, CONSTANT)
     assert flights.collided.tolist() == [True, False, True]
     assert flights.steps[1] == 1
     assert flights.least_separation[0] == pytest.approx(4.5, abs=0.01)

@@ -13,18 +13,20 @@ import yaml
 from matplotlib.colors import to_hex
 
 from envs.aircraft import AircraftVectorEnv
-from safemr import aircraft, aircraft_evidence, config, records, runs, statistics
-from safemr.aircraft_evidence import TrueSets
+from safemr.aircraft import scoring, unsafe_sets
+from safemr.aircraft.reachability import ADVERSARIAL, CONSTANT, Grid, Solution, solve
+from safemr.aircraft.scoring import TrueSets
+from safemr.certificates.energy import in_metres
 from safemr.conventions import COVERS
-from safemr.energy import in_metres
 from safemr.errors import UserError
-from safemr.measurements import Measurements
-from safemr.networks import StackedMLP
-from safemr.observation import ObservationTransform
-from safemr.plotting import aircraft as pictures
-from safemr.plotting import style
-from safemr.policies import Policy
-from safemr.reachability import ADVERSARIAL, CONSTANT, Grid, Solution, solve
+from safemr.experiment import config, planning, records
+from safemr.learning.networks import StackedMLP
+from safemr.learning.observation import ObservationTransform
+from safemr.learning.policies import Policy
+from safemr.measure.store import Measurements
+from safemr.report import statistics
+from safemr.report.figures import aircraft as pictures
+from safemr.report.figures import style
 
 ROOT = Path(__file__).resolve().parents[1]
 # Per variant and seed: zeta in units of five metres.
@@ -52,7 +54,7 @@ def sets(solutions: tuple[Solution, Solution]) -> TrueSets:
 
 
 @pytest.fixture(scope="module")
-def truth(sets: TrueSets) -> aircraft.Truth:
+def truth(sets: TrueSets) -> unsafe_sets.Truth:
     return sets.truth
 
 
@@ -78,7 +80,7 @@ def write(
     hyperparameters = {"eta": 0.01}
     described = {"name": algorithm, "version": 1, "hyperparameters": hyperparameters}
     run: dict[str, Any] = {
-        **{"schema": 1, "task": runs.installed(task), "algorithm": described},
+        **{"schema": 1, "task": planning.installed(task), "algorithm": described},
         **{"seed": seed, "steps": 10, "log_every": 10},
         "evaluation": {"every": 10, "episodes": 1, "seed": 0},
     }
@@ -97,7 +99,7 @@ def index(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, pd.DataFrame]
 
 @pytest.fixture(scope="module")
 def comparison(sets: TrueSets, index: tuple[Path, pd.DataFrame]) -> pd.DataFrame:
-    return aircraft_evidence.compare(sets, FRONTIER, *index, flights=200)
+    return scoring.compare(sets, FRONTIER, *index, flights=200)
 
 
 def test_what_was_measured_needs_no_solution_again(
@@ -107,10 +109,10 @@ def test_what_was_measured_needs_no_solution_again(
         raise AssertionError("solved again")
 
     nothing = TrueSets(unavailable, log2_states=13)
-    again = aircraft_evidence.compare(nothing, FRONTIER, *index, flights=200)
+    again = scoring.compare(nothing, FRONTIER, *index, flights=200)
     pd.testing.assert_frame_equal(again, comparison)
     with pytest.raises(AssertionError, match="solved again"):
-        aircraft_evidence.compare(nothing, FRONTIER, *index, flights=201)
+        scoring.compare(nothing, FRONTIER, *index, flights=201)
 
 
 def test_every_run_and_every_reference_has_a_row(comparison: pd.DataFrame) -> None:
@@ -118,10 +120,10 @@ def test_every_run_and_every_reference_has_a_row(comparison: pd.DataFrame) -> No
     assert set(zip(learners["variant"], learners["seed"], strict=True)) == ZETAS.keys()
     names = set(comparison["variant"]) - {variant for variant, _ in ZETAS}
     assert names == {
-        *aircraft_evidence.CERTIFICATES,
-        aircraft_evidence.TRUE_SET,
-        aircraft_evidence.ADVERSARIAL_SET,
-        aircraft_evidence.STRAIGHT,
+        *scoring.CERTIFICATES,
+        scoring.TRUE_SET,
+        scoring.ADVERSARIAL_SET,
+        scoring.STRAIGHT,
     }
 
 
@@ -137,25 +139,27 @@ def test_a_record_in_other_units_is_the_same_certificate(comparison: pd.DataFram
         assert rows.loc["FAC-phih", metric] == pytest.approx(rows.loc["phi_h", metric], abs=1e-3)
 
 
-def test_rows_hold_what_the_measures_say(comparison: pd.DataFrame, truth: aircraft.Truth) -> None:
+def test_rows_hold_what_the_measures_say(
+    comparison: pd.DataFrame, truth: unsafe_sets.Truth
+) -> None:
     row = comparison[(comparison["variant"] == "JointSIS") & (comparison["seed"] == 101)].iloc[0]
-    phi = aircraft.energy_certificate(CONSTANT, np.float32(ZETAS["JointSIS", 101]).tolist(), 5.0)
-    expected = aircraft.compare_certificate(truth, phi, eta=0.01)
-    for metric in aircraft_evidence.COLUMNS:
+    phi = unsafe_sets.energy_certificate(CONSTANT, np.float32(ZETAS["JointSIS", 101]).tolist(), 5.0)
+    expected = unsafe_sets.compare_certificate(truth, phi, eta=0.01)
+    for metric in scoring.COLUMNS:
         assert row[metric] == getattr(expected, metric)
     assert row["eta"] == 0.01
     assert row["least_volume_ratio"] == pytest.approx(1.9 - 6.0 * row["missed_share"])
     rows = comparison.set_index("variant")
     # A constant turn of 0.5 rad/s costs 0.25 a step; no turn costs nothing and is straight flight.
     assert rows.loc["SafeMR", "effort_per_step"].tolist() == pytest.approx([0.25, 0.25])
-    straight = rows.loc[aircraft_evidence.STRAIGHT, "collision_share"]
+    straight = rows.loc[scoring.STRAIGHT, "collision_share"]
     assert rows.loc["JointSIS", "collision_share"].tolist() == [straight, straight]
-    assert rows.loc[aircraft_evidence.TRUE_SET, "collision_share"] < 0.1 * straight
+    assert rows.loc[scoring.TRUE_SET, "collision_share"] < 0.1 * straight
     # Obeying phi_0 says to turn in the last moment; a certificate that nearly covers helps.
     obeyed = rows.loc[["phi_0", "phi_h", "code init"], "collision_share"]
     assert obeyed.is_monotonic_decreasing
     assert obeyed.iloc[-1] < 0.7 * straight
-    assert 1.15 < rows.loc[aircraft_evidence.ADVERSARIAL_SET, "volume_ratio"] < 1.3
+    assert 1.15 < rows.loc[scoring.ADVERSARIAL_SET, "volume_ratio"] < 1.3
 
 
 def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
@@ -166,22 +170,20 @@ def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
         columns=["task", "variant", "seed"],
     )
     missing = statistics.missing_runs(expected, index[1])
-    table = aircraft_evidence.comparison_table(comparison, missing)
+    table = scoring.comparison_table(comparison, missing)
     assert table.notes[-1] == "Runs missing: SafeMR on Aircraft (seeds 102, 103)."
     shown = table.display.set_index("certificate")
     ours = comparison[comparison["variant"] == "SafeMR"]
     mean = statistics.mean_interval(ours["volume_ratio"].to_numpy())
     assert shown.loc["SafeMR", "volume ratio"] == f"{mean.mean:.2f}"  # two seeds: no interval
     assert shown.loc["SafeMR", ["seeds", "covers"]].tolist() == ["2", "0 of 2"]
-    assert shown.loc[aircraft_evidence.TRUE_SET, ["missed %", "covers"]].tolist() == [
+    assert shown.loc[scoring.TRUE_SET, ["missed %", "covers"]].tolist() == [
         "0.0",
         "yes",
     ]
     gap = statistics.difference_interval(
         *(
-            statistics.scores_of(
-                aircraft_evidence.as_scores(comparison), "Aircraft", variant, "volume_ratio"
-            )
+            statistics.scores_of(scoring.as_scores(comparison), "Aircraft", variant, "volume_ratio")
             for variant in ("SafeMR", "JointSIS")
         )
     )
@@ -196,10 +198,10 @@ def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
 
 def test_without_any_run_the_references_remain(sets: TrueSets, tmp_path: Path) -> None:
     none = pd.DataFrame(columns=["task", "variant", "seed", "folder"])
-    comparison = aircraft_evidence.compare(sets, FRONTIER, tmp_path, none, flights=20)
-    table = aircraft_evidence.comparison_table(comparison, none)
+    comparison = scoring.compare(sets, FRONTIER, tmp_path, none, flights=20)
+    table = scoring.comparison_table(comparison, none)
     assert table.notes == ()
-    assert set(aircraft_evidence.CERTIFICATES) <= set(table.display["certificate"])
+    assert set(scoring.CERTIFICATES) <= set(table.display["certificate"])
     pictures.frontier(FRONTIER, comparison, COVERS)
 
 
@@ -210,12 +212,12 @@ def test_records_that_do_not_say_their_certificate_are_all_named(
     write(tmp_path, "Baseline", 101, turning(0.1))
     index = records.read_records(tmp_path)[0]
     with pytest.raises(UserError, match=r"zeta.*Baseline/seed101.*Silent/seed100"):
-        aircraft_evidence.compare(sets, FRONTIER, tmp_path, index, flights=20)
+        scoring.compare(sets, FRONTIER, tmp_path, index, flights=20)
 
 
-def test_frontier_table_is_the_frontier(truth: aircraft.Truth) -> None:
-    table = aircraft_evidence.frontier_table(truth, [0.1, 1.0])
-    (point, _) = aircraft.frontier(truth, [0.1, 1.0])
+def test_frontier_table_is_the_frontier(truth: unsafe_sets.Truth) -> None:
+    table = scoring.frontier_table(truth, [0.1, 1.0])
+    (point, _) = unsafe_sets.frontier(truth, [0.1, 1.0])
     assert table.loc[0].tolist() == [0.1, point.volume_ratio, *point.zeta]
     assert table["volume_ratio"].is_monotonic_decreasing
 
@@ -266,7 +268,7 @@ def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
 def test_slices_hold_the_sets_of_the_comparison(
     comparison: pd.DataFrame, sets: TrueSets, tmp_path: Path
 ) -> None:
-    x, y, (cut,) = aircraft_evidence.slices(
+    x, y, (cut,) = scoring.slices(
         sets, comparison, Measurements(tmp_path), degrees=[180], spacing=0.5
     )
     assert set(cut.learned) == {"SafeMR", "JointSIS"}
@@ -282,14 +284,14 @@ def test_slices_hold_the_sets_of_the_comparison(
 def test_shipped_learners_start_alike_and_mean_the_papers_certificates(name: str) -> None:
     """Whatever the unit: SafeMR and JointSIS share a start, FAC has phi_h and phi_0."""
     files = [ROOT / "config/config.yaml", ROOT / f"config/{name}.yaml"]
-    plan = runs.resolve(config.load(files))
+    plan = planning.resolve(config.load(files))
     zetas = {}
     for run in plan.aircraft:
         values = run.config["algorithm"]["hyperparameters"]
         zeta = [values[parameter] for parameter in ("sigma", "k", "n")]
         zetas[run.variant] = in_metres(zeta, values["length_scale"])
         assert values["target_entropy"] == -1.0
-    certificates = aircraft_evidence.CERTIFICATES
+    certificates = scoring.CERTIFICATES
     assert zetas["FAC-phih"] == pytest.approx(certificates["phi_h"])
     assert zetas["FAC-phi0"] == pytest.approx(certificates["phi_0"])
     for variant in zetas.keys() - {"FAC-phih", "FAC-phi0"}:
@@ -338,8 +340,8 @@ def test_a_record_is_held_against_the_true_set_of_its_own_traffic(
     write(tmp_path, "SafeMR", 0, certified(), MIRRORED)
     index = records.read_records(tmp_path)[0]
     with pytest.raises(UserError, match=r"flew with other_turn = -1, the true .* that of 1"):
-        aircraft_evidence.compare(sets, FRONTIER, tmp_path, index, flights=50)
-    found = aircraft_evidence.compare(mirrored, FRONTIER, tmp_path, index, flights=50)
+        scoring.compare(sets, FRONTIER, tmp_path, index, flights=50)
+    found = scoring.compare(mirrored, FRONTIER, tmp_path, index, flights=50)
     ours = found[found["variant"] == "SafeMR"].iloc[0]
     # The energy is its own mirror image, so its shares are those of the right-turning traffic.
     straight = comparison[(comparison["variant"] == "JointSIS") & (comparison["seed"] == 100)].iloc[
@@ -347,19 +349,17 @@ def test_a_record_is_held_against_the_true_set_of_its_own_traffic(
     ]
     for metric in ("volume_ratio", "missed_share", "iou"):
         assert ours[metric] == pytest.approx(straight[metric], abs=0.02)
-    assert aircraft_evidence.comparison_table(found, task=MIRRORED).caption.startswith(
-        "Aircraft-left. "
-    )
+    assert scoring.comparison_table(found, task=MIRRORED).caption.startswith("Aircraft-left. ")
 
 
 def test_kept_measurements_of_the_registered_traffic_keep_their_names(
     sets: TrueSets, mirrored: TrueSets
 ) -> None:
     assert sets.kept_as("frontier") == ("frontier", {})
-    entry = runs.describe_task("Aircraft", {})
+    entry = planning.describe_task("Aircraft", {})
     assert TrueSets(sets._solve, 13, entry).kept_as("slices") == ("slices", {})
     assert mirrored.kept_as("frontier") == (
-        "frontier Aircraft-left", {"task": runs.installed(MIRRORED)}
+        "frontier Aircraft-left", {"task": planning.installed(MIRRORED)}
     )  # fmt: skip
 
 
@@ -383,4 +383,4 @@ def test_a_neural_certificate_is_not_compared_as_its_fixed_part(
     write(tmp_path, "Neural", 0, {**certified(), **network}, algorithm="neural_safemr")
     index = records.read_records(tmp_path)[0]
     with pytest.raises(UserError, match=r"neural_safemr is a network beside a fixed"):
-        aircraft_evidence.compare(sets, FRONTIER, tmp_path, index, flights=50)
+        scoring.compare(sets, FRONTIER, tmp_path, index, flights=50)

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safemr.buffers import Replay
+from safemr.learning.replay import Replay
 
 GAMMA = 0.9
 

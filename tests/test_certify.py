@@ -12,17 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_record import CONFIG, ROWS
 
-from safemr import certify, falsification, records, reference
-from safemr.energy import energy
+from safemr import paper
+from safemr.certificates import falsification
+from safemr.certificates.energy import energy
+from safemr.certificates.falsification import ROBOT
+from safemr.certificates.feasibility import analytic_condition, radial_requirement
+from safemr.certificates.point_robot import PointRobot
 from safemr.errors import UserError
-from safemr.falsification import ROBOT
-from safemr.feasibility import analytic_condition, radial_requirement
-from safemr.measurements import Measurements
-from safemr.point_robot import PointRobot
-from safemr.reference import Zeta
+from safemr.experiment import records
+from safemr.measure import certify
+from safemr.measure.store import Measurements
+from safemr.paper import Zeta
 
 ROOT = Path(__file__).resolve().parents[1]
-LEARNED = list(reference.TABLE_II.values())
+LEARNED = list(paper.TABLE_II.values())
 D_MIN = 0.25
 TASK = "Pillars-0.15-Goal"
 
@@ -49,7 +52,7 @@ def random_states(count: int, seed: int = 0) -> np.ndarray:
 # --- (a) the analytic condition ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("zeta", [*LEARNED, reference.PHI_H])
+@pytest.mark.parametrize("zeta", [*LEARNED, paper.PHI_H])
 def test_each_set_holds_with_the_aligned_brake_and_fails_with_drag_alone(zeta):
     table = analytic_condition(zeta, D_MIN).set_index(["convention", "braking"])["holds"]
     assert table.xs("aligned brake", level="braking").all()
@@ -86,7 +89,7 @@ def test_eta_needs_more_deceleration():
 
 
 def test_an_energy_without_velocity_has_no_finite_requirement():
-    assert not analytic_condition(reference.PHI_0, D_MIN)["holds"].any()
+    assert not analytic_condition(paper.PHI_0, D_MIN)["holds"].any()
 
 
 # --- the model and the simulator -----------------------------------------------------------------
@@ -163,7 +166,7 @@ def test_refinement_finds_that_no_learned_set_is_feasible_everywhere(pillars):
 
 
 def test_distance_alone_leaks_and_a_strong_velocity_term_does_not(pillars):
-    bare = falsification.falsify(pillars, TASK, reference.PHI_0, count=2048, rounds=1)
+    bare = falsification.falsify(pillars, TASK, paper.PHI_0, count=2048, rounds=1)
     assert bare.leak_share > 0.005  # too fast to stop within one step of contact
     strong = falsification.falsify(pillars, TASK, Zeta(0.3, 3.0, 1.0), count=2048, rounds=1)
     assert strong.leak_share == 0.0

@@ -19,10 +19,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from sample_record import CONFIG, POLICY, ROWS
 
-from safemr import atomic, checkpoints, records
-from safemr.checkpoints import RunSession
+from safemr import files
 from safemr.errors import UserError
-from safemr.train import Progress
+from safemr.experiment import checkpoints, records
+from safemr.experiment.checkpoints import RunSession
+from safemr.experiment.train import Progress
 
 arrays = hnp.arrays(
     st.sampled_from([np.float64, np.float32, np.int64, np.int32, np.uint64, np.uint8, np.bool_]),
@@ -251,7 +252,7 @@ def test_a_kill_in_the_middle_of_a_checkpoint(tmp_path: Path) -> None:
     if pid == 0:
         with (
             RunSession(CONFIG, "FAC-phih", tmp_path),
-            atomic.replacing(session.work / "checkpoint.pt") as stream,
+            files.replacing(session.work / "checkpoint.pt") as stream,
         ):
             stream.write(b"half")
             stream.flush()

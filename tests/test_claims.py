@@ -11,8 +11,9 @@ import pandas as pd
 import pytest
 from sample_scores import OTHER, TASK, expected_runs, score_rows
 
-from safemr import claims, reference
-from safemr.evidence import Evidence
+from safemr import paper
+from safemr.report import claims
+from safemr.report.findings import Evidence
 
 
 @pytest.fixture
@@ -227,7 +228,7 @@ def test_the_claims_table_says_where_seeds_agree_exactly(scores):
 
 
 def test_a_claims_table_without_any_run_is_complete_and_inconclusive():
-    nothing = evidence(score_rows().iloc[:0], tasks=reference.TASKS)
+    nothing = evidence(score_rows().iloc[:0], tasks=paper.TASKS)
     table = claims.claims_table(nothing)
     assert set(table.data["verdict"]) == {"inconclusive"}
     assert table.data["reason"].str.startswith("runs missing: ").all()
@@ -241,7 +242,7 @@ def test_a_grid_without_a_task_of_the_paper_gets_no_verdict(scores):
            "margin_inside_drag": 1.0, "margin_outside_drag": 1.0}  # fmt: skip
     given = evidence(
         elsewhere,
-        tasks=reference.TASKS,
+        tasks=paper.TASKS,
         expected=elsewhere[["task", "variant", "seed"]].drop_duplicates(),
         certificates=pd.DataFrame([row]),
     )
@@ -253,7 +254,7 @@ def test_a_grid_without_a_task_of_the_paper_gets_no_verdict(scores):
 
 def test_a_grid_with_one_task_of_the_paper_is_judged_on_it(scores):
     ours = with_baselines(scores[scores["task"] == TASK])
-    given = evidence(ours, tasks=reference.TASKS, expected=ours[["task", "variant", "seed"]])
+    given = evidence(ours, tasks=paper.TASKS, expected=ours[["task", "variant", "seed"]])
     table = claims.claims_table(given).data.set_index("claim")["verdict"]
     assert table[f"highest_return[{TASK}]"] == "confirmed"
     assert table[f"highest_return[{OTHER}]"] == "not run"
@@ -267,7 +268,7 @@ def test_two_seeds_confirm_nothing(scores):
     assert "confirmed" not in set(verdicts)
     assert verdicts["zero_violations"] == verdicts["unsafe[CPO]"] == "inconclusive"
     assert verdicts["safe_but_lower[JointSIS]"] == "inconclusive"
-    unsafe = two["variant"].isin([*reference.BASELINES]) & (two["metric"] == "eval_cost_indicator")
+    unsafe = two["variant"].isin([*paper.BASELINES]) & (two["metric"] == "eval_cost_indicator")
     two.loc[unsafe, "value"] = 9.0
     assert verdict(f"highest_return[{TASK}]", evidence(two)) == "inconclusive"
     one = (two["variant"] == "SafeMR") & (two["metric"] == "eval_zero_violation_share")

@@ -13,10 +13,10 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safemr import config, runs
 from safemr.errors import UserError
-from safemr.plan_cache import plan_for
-from safemr.strict_yaml import StrictLoader
+from safemr.experiment import config, planning
+from safemr.experiment.plan_cache import plan_for
+from safemr.experiment.strict_yaml import StrictLoader
 
 ROOT = Path(__file__).resolve().parents[1]
 DEFAULT = ROOT / "config/config.yaml"
@@ -243,8 +243,8 @@ def changed(path: tuple[str, ...], value: Any) -> Any:
     return result
 
 
-def resolve(raw: Any) -> runs.Plan:
-    return runs.resolve(config.parse(raw))
+def resolve(raw: Any) -> planning.Plan:
+    return planning.resolve(config.parse(raw))
 
 
 def one_line(error: UserError) -> str:
@@ -391,7 +391,7 @@ def test_roots_may_lie_outside_the_repository(
         for root in ("../up", "../../up/a.b", f"{tmp_path}/away", "/data/safemr", "x/y"):
             parsed = config.parse(changed((key,), root))
             assert getattr(parsed, key) == Path(root)
-            assert [run.path for run in runs.resolve(parsed).runs] == before
+            assert [run.path for run in planning.resolve(parsed).runs] == before
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match="is a file"):
         config.parse(changed(("results_root",), "../file"))
@@ -463,11 +463,11 @@ def test_equal_settings_have_equal_digests() -> None:
 
 def test_version_bumps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     before = {run.path for run in resolve(VALID).runs}
-    module = runs.importlib.import_module("safemr.algorithms.ppo_lagrangian")
+    module = planning.importlib.import_module("safemr.algorithms.ppo_lagrangian")
     monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
-    runs.load_algorithm.cache_clear()
+    planning.load_algorithm.cache_clear()
     after = {run.path for run in resolve(VALID).runs}
-    runs.load_algorithm.cache_clear()
+    planning.load_algorithm.cache_clear()
     assert {path.parts[2] for path in after - before} == {"PPO-L"}
     assert len(after - before) == 4
 
@@ -498,7 +498,7 @@ def test_every_shipped_config_is_valid(path: Path) -> None:
 
 
 def test_the_default_is_the_papers_grid_of_170_runs() -> None:
-    plan = runs.resolve(config.load([DEFAULT]))
+    plan = planning.resolve(config.load([DEFAULT]))
     assert len(plan.navigation) == 7 * 4 * 5
     assert len(plan.aircraft) == 4 * 5
     assert len(plan.trained) == 140 + 2 * 5 + 20
@@ -510,8 +510,8 @@ def test_plans_are_remembered_until_something_changes(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     calls = []
-    real = runs.resolve
-    monkeypatch.setattr(runs, "resolve", lambda c: calls.append(c) or real(c))
+    real = planning.resolve
+    monkeypatch.setattr(planning, "resolve", lambda c: calls.append(c) or real(c))
     first = plan_for(config.parse(VALID))
     assert plan_for(config.parse(VALID)) == first
     assert len(calls) == 1

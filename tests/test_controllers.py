@@ -6,8 +6,9 @@ import gymnasium
 import numpy as np
 import pytest
 
-from safemr import controllers, tables
-from safemr.evaluate import evaluate
+from safemr.learning.evaluation import evaluate
+from safemr.measure import controllers
+from safemr.report import tables
 
 PUSH, GOAL = "Hazards-0.15-Push", "Pillars-0.15-Goal"
 

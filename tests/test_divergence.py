@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from safemr import inspection, train, training
+from safemr.experiment import overview, train
+from safemr.learning import contract
 
 ROOT = Path(__file__).resolve().parents[1]
 TASK, SHORT = "Hazards-0.15-Push", ("task.max_episode_steps=50", "hidden=16")
@@ -42,7 +43,7 @@ def test_a_diverging_run_ends_in_one_line_and_is_named(
         lines[0],
     )
     assert not list(tmp_path.glob("runs/*/*/*"))
-    assert inspection.main([str(tmp_path)]) == 0
+    assert overview.main([str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert f"{name} {TASK} seed 100" in printed
     assert "failed: " in printed
@@ -50,14 +51,14 @@ def test_a_diverging_run_ends_in_one_line_and_is_named(
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e9, -1e9])
 def test_what_is_absurdly_large_counts_as_infinite(value: float) -> None:
-    with pytest.raises(training.TrainingDivergedError) as caught:
-        training.check_finite(7, {"updates": 1e9, "policy_loss": 1.0, "temperature": value})
+    with pytest.raises(contract.TrainingDivergedError) as caught:
+        contract.check_finite(7, {"updates": 1e9, "policy_loss": 1.0, "temperature": value})
     error = caught.value
     assert (error.step, error.quantity) == (7, "temperature")
     assert error.value == value or (math.isnan(error.value) and math.isnan(value))
     parameters = torch.tensor([0.5, value, -2.0])
-    with pytest.raises(training.TrainingDivergedError, match="policy_parameters became"):
-        training.check_parameters(7, parameters)
+    with pytest.raises(contract.TrainingDivergedError, match="policy_parameters became"):
+        contract.check_parameters(7, parameters)
 
 
 def test_the_bounds_are_far_from_every_recorded_run() -> None:
@@ -71,7 +72,7 @@ def test_the_bounds_are_far_from_every_recorded_run() -> None:
                     if text and not name.startswith(("time_", "step", "train_", "eval_")):
                         largest[name] = max(largest.get(name, 0.0), abs(float(text)))
     assert largest["cost_grad_norm"] > 100
-    training.check_finite(0, {name: 1_000 * value for name, value in largest.items()})
+    contract.check_finite(0, {name: 1_000 * value for name, value in largest.items()})
     for path in ROOT.glob("results/**/policy.npz"):
         with np.load(path) as arrays:
-            training.check_parameters(0, 1_000 * torch.from_numpy(arrays["policy_parameters"]))
+            contract.check_parameters(0, 1_000 * torch.from_numpy(arrays["policy_parameters"]))

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safemr import energy
+from safemr.certificates import energy
 
 lengths = st.floats(0.05, 20.0)
 rates = st.floats(-5.0, 5.0)

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 import envs  # noqa: F401  (registers the tasks)
 from envs import aircraft, navigation, rendering
-from safemr.runs import describe_task
-from safemr.train import make_envs
+from safemr.experiment.planning import describe_task
+from safemr.experiment.train import make_envs
 
 IDS = sorted(
     spec.id for spec in gymnasium.registry.values() if str(spec.entry_point).startswith("envs.")

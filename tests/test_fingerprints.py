@@ -24,7 +24,7 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 from toy import ToyEnvs  # noqa: E402
 
-from safemr import records, runs  # noqa: E402
+from safemr.experiment import planning, records  # noqa: E402
 
 FILE = Path(__file__).with_name("fingerprints.json")
 # Round-off differs between processors; behaviour does not differ by so little.
@@ -38,7 +38,7 @@ SMALL = {
 
 def fingerprint(name: str) -> dict[str, Any]:
     """VERSION and the metrics of a short training with all defaults but its size."""
-    algorithm = runs.load_algorithm(name)
+    algorithm = planning.load_algorithm(name)
     fields = algorithm.hyperparameters.__dataclass_fields__
     small = {field: value for field, value in SMALL[algorithm.family].items() if field in fields}
     trainer = algorithm.trainer(algorithm.hyperparameters(**small), ToyEnvs, 0, STEPS)
@@ -63,7 +63,7 @@ def renewed(
     }
 
 
-@pytest.mark.parametrize("name", runs.algorithm_names())
+@pytest.mark.parametrize("name", planning.algorithm_names())
 def test_behaviour_changes_only_with_the_version(name):
     stored = json.loads(FILE.read_text()).get(name)
     remedy = f"bump VERSION in safemr/algorithms/{name}.py if meant, then run: python {__file__}"
@@ -85,7 +85,7 @@ def test_behaviour_changes_only_with_the_version(name):
 def test_a_changed_hyperparameter_changes_the_fingerprint():
     """The comparison can fail: a slightly different learning rate is outside the tolerance."""
     name = "joint_sis"
-    algorithm = runs.load_algorithm(name)
+    algorithm = planning.load_algorithm(name)
     small = {**SMALL["off_policy"], "critic_lr": 1.2e-3}
     trainer = algorithm.trainer(algorithm.hyperparameters(**small), ToyEnvs, 0, STEPS)
     stored, now = json.loads(FILE.read_text())[name]["metrics"], trainer.advance(STEPS)
@@ -93,7 +93,7 @@ def test_a_changed_hyperparameter_changes_the_fingerprint():
 
 
 def test_the_algorithms_of_this_repository_have_fingerprints():
-    recorded = recorded_algorithms(ROOT / "results") & set(runs.algorithm_names())
+    recorded = recorded_algorithms(ROOT / "results") & set(planning.algorithm_names())
     assert len(recorded) > 5
     assert recorded <= json.loads(FILE.read_text()).keys()
 
@@ -111,7 +111,7 @@ def test_only_new_algorithms_and_versions_get_a_new_fingerprint():
 
 if __name__ == "__main__":
     before = json.loads(FILE.read_text())
-    versions = {name: runs.load_algorithm(name).version for name in runs.algorithm_names()}
+    versions = {name: planning.load_algorithm(name).version for name in planning.algorithm_names()}
     prints = renewed(before, versions, fingerprint)
     FILE.write_text(json.dumps(prints, indent=1, sort_keys=True) + "\n")
     changed = [name for name, value in prints.items() if before.get(name) != value]

@@ -10,20 +10,20 @@ from pathlib import Path
 import pytest
 import yaml
 
-from safemr import records, runs
-from safemr.forecast import announced
+from safemr.experiment import planning, records
+from safemr.experiment.forecast import announced
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def run(
     algorithm: str, task: str = "Pillars-0.15-Goal", seed: int = 0, steps: int = 6000
-) -> runs.Run:
-    described = runs.load_algorithm(algorithm)
-    return runs.make_run(
-        runs.describe_task(task, {}),
+) -> planning.Run:
+    described = planning.load_algorithm(algorithm)
+    return planning.make_run(
+        planning.describe_task(task, {}),
         described,
-        runs.hyperparameters(described, {}, algorithm),
+        planning.hyperparameters(described, {}, algorithm),
         variant=algorithm.upper(),
         seed=seed,
         steps=steps,
@@ -32,7 +32,7 @@ def run(
     )
 
 
-def record(root: Path, done: runs.Run, cpu_s: float) -> None:
+def record(root: Path, done: planning.Run, cpu_s: float) -> None:
     row = {"step": 6000.0, "eval_return": 1.0, "eval_cost": 0.0, "eval_zero_violation_share": 1.0}
     folder = root / done.path
     records.write_record(folder, done.config, done.variant, [row], {"cpu_s": cpu_s})

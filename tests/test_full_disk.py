@@ -13,9 +13,10 @@ import pytest
 import torch
 from sample_record import CONFIG, ROWS
 
-from safemr import atomic, records, train
-from safemr.checkpoints import RunSession
+from safemr import files
 from safemr.errors import UserError
+from safemr.experiment import records, train
+from safemr.experiment.checkpoints import RunSession
 
 
 @pytest.fixture
@@ -32,10 +33,10 @@ def test_a_failed_write_leaves_the_old_file(
     tmp_path: Path, full_disk: Callable[[int], None]
 ) -> None:
     path = tmp_path / "file"
-    atomic.write(path, b"old")
+    files.write(path, b"old")
     full_disk(100)
     with pytest.raises(OSError, match="File too large"):
-        atomic.write(path, bytes(1000))
+        files.write(path, bytes(1000))
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 

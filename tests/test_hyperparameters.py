@@ -14,8 +14,9 @@ import pytest
 import torch
 from toy import ToyEnvs
 
-from safemr import catalogue, hyperparameters, listing, runs, train
 from safemr.errors import UserError
+from safemr.experiment import catalogue, listing, planning, train
+from safemr.learning import hyperparameters
 
 STEPS = 800
 SMALL: dict[str, dict[str, Any]] = {
@@ -88,15 +89,15 @@ def accepted(algorithm: catalogue.Algorithm, values: dict[str, Any]) -> bool:
 
 FIELDS = {
     (name, field.name)
-    for name in runs.algorithm_names()
-    for field in dataclasses.fields(runs.load_algorithm(name).hyperparameters)
+    for name in planning.algorithm_names()
+    for field in dataclasses.fields(planning.load_algorithm(name).hyperparameters)
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", runs.algorithm_names())
+@pytest.mark.parametrize("name", planning.algorithm_names())
 def test_every_hyperparameter_changes_the_numbers_or_is_refused(name: str) -> None:
-    algorithm = runs.load_algorithm(name)
+    algorithm = planning.load_algorithm(name)
     reference = {"": trained(algorithm, {})}
     silent = []
     for field in sorted(field for owner, field in FIELDS if owner == name):
@@ -112,9 +113,9 @@ def test_every_hyperparameter_changes_the_numbers_or_is_refused(name: str) -> No
     assert not silent, f"{name} accepts {', '.join(silent)} and does not use them: see UNUSED"
 
 
-@pytest.mark.parametrize("name", runs.algorithm_names())
+@pytest.mark.parametrize("name", planning.algorithm_names())
 def test_what_is_declared_unused_is_so_and_cannot_be_set(name: str) -> None:
-    algorithm = runs.load_algorithm(name)
+    algorithm = planning.load_algorithm(name)
     ignored = hyperparameters.unused(algorithm.hyperparameters)
     if not ignored:
         return
@@ -135,7 +136,7 @@ def test_what_is_declared_unused_is_so_and_cannot_be_set(name: str) -> None:
 def test_the_box_refuses_a_start_outside(name: str) -> None:
     for bound, value in BOUNDS_OF_THE_START.items():
         with pytest.raises(UserError, match=rf"^{bound.partition('_')[0]} = "):
-            runs.load_algorithm(name).hyperparameters(**{bound: value})
+            planning.load_algorithm(name).hyperparameters(**{bound: value})
 
 
 @pytest.mark.parametrize(
@@ -154,9 +155,9 @@ def test_intervals(value: float, interval: str, expected: bool) -> None:
     assert hyperparameters.within(value, interval) is expected
 
 
-@pytest.mark.parametrize("name", runs.algorithm_names())
+@pytest.mark.parametrize("name", planning.algorithm_names())
 def test_every_number_has_a_range_and_every_default_lies_in_it(name: str) -> None:
-    config = runs.load_algorithm(name).hyperparameters
+    config = planning.load_algorithm(name).hyperparameters
     ranges = hyperparameters.declared(config, "RANGES")
     hints = typing.get_type_hints(config)
     for field in dataclasses.fields(config):
@@ -164,9 +165,9 @@ def test_every_number_has_a_range_and_every_default_lies_in_it(name: str) -> Non
             assert hyperparameters.within(field.default, ranges[field.name]), field.name
 
 
-@pytest.mark.parametrize("name", runs.algorithm_names())
+@pytest.mark.parametrize("name", planning.algorithm_names())
 def test_every_hyperparameter_has_a_meaning(name: str) -> None:
-    found = hyperparameters.meanings(runs.load_algorithm(name).hyperparameters)
+    found = hyperparameters.meanings(planning.load_algorithm(name).hyperparameters)
     assert not [field for field, meaning in found.items() if len(meaning) < 8]
 
 
@@ -200,11 +201,11 @@ def test_where_a_meaning_is_read() -> None:
 def test_the_overview_names_every_task_and_algorithm(capsys: pytest.CaptureFixture[str]) -> None:
     assert listing.main([]) == 0
     lines = capsys.readouterr().out.splitlines()
-    for task in runs.task_names():
+    for task in planning.task_names():
         assert f"  {task}" in lines
-    for name in runs.algorithm_names():
+    for name in planning.algorithm_names():
         (line,) = (line for line in lines if line.split()[:1] == [name])
-        assert line.split()[1] == runs.load_algorithm(name).family
+        assert line.split()[1] == planning.load_algorithm(name).family
         assert len(line.split()) > 4  # a description
 
 
@@ -213,7 +214,7 @@ def test_an_algorithm_is_listed_with_type_default_and_meaning(
 ) -> None:
     assert listing.main(["safemr", "sac_lagrangian"]) == 0
     ours, other = capsys.readouterr().out.split("\n\n")
-    config = runs.load_algorithm("safemr").hyperparameters
+    config = planning.load_algorithm("safemr").hyperparameters
     for field, meaning in hyperparameters.meanings(config).items():
         default = next(f.default for f in dataclasses.fields(config) if f.name == field)
         assert f"  {field} " in ours
@@ -224,7 +225,7 @@ def test_an_algorithm_is_listed_with_type_default_and_meaning(
     assert other.count("not used: there is no energy function") == 6
     assert listing.main(["--all"]) == 0
     printed = capsys.readouterr().out
-    assert all(f"{name} (o" in printed for name in runs.algorithm_names())
+    assert all(f"{name} (o" in printed for name in planning.algorithm_names())
     with pytest.raises(UserError, match="did you mean 'ppo_lagrangian'"):
         listing.main(["ppo"])
 
@@ -234,7 +235,7 @@ def test_the_help_of_train_says_what_there_is(capsys: pytest.CaptureFixture[str]
         train.main(["--help"])
     assert ended.value.code == 0
     printed = "".join(capsys.readouterr().out.split())
-    for name in (*runs.task_names(), *runs.algorithm_names(), "safemrlist"):
+    for name in (*planning.task_names(), *planning.algorithm_names(), "safemrlist"):
         assert name in printed, name
 
 

@@ -25,18 +25,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from safemr import (
-    aircraft_evidence,
-    certify,
-    controllers,
-    evaluate,
-    measurements,
-    neural_evidence,
-    records,
-    rollouts,
-)
-from safemr.measurements import HEADER, Measurements
-from safemr.plotting import data
+from safemr import files
+from safemr.aircraft import neural, scoring
+from safemr.experiment import records
+from safemr.learning import evaluation
+from safemr.measure import certify, controllers, store, trajectories
+from safemr.measure.store import HEADER, Measurements
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 QUICK = RESULTS / "quick"  # has every kind, the neural energies too
@@ -52,10 +46,10 @@ class Again:
 
     def kept(self, kind: str, label: str) -> tuple[Path, dict[str, Any]]:
         """The file that the repository keeps under a label, and its header."""
-        (path,) = (self.recorded / measurements.FOLDER / kind).glob(f"{label}-*")
+        (path,) = (self.recorded / store.FOLDER / kind).glob(f"{label}-*")
         if path.suffix == ".json":
             return path, json.loads(path.read_text())
-        return path, json.loads(str(data.load(path)[HEADER]))
+        return path, json.loads(str(files.load_arrays(path)[HEADER]))
 
     def record(self, inputs: Mapping[str, Any]) -> Path:
         """A copy of the record that a measurement was made on."""
@@ -63,8 +57,8 @@ class Again:
         shutil.copytree(self.recorded / place, self.root / place, dirs_exist_ok=True)
         return self.root / place
 
-    def sets(self, log2_states: int) -> aircraft_evidence.TrueSets:
-        return aircraft_evidence.TrueSets.cached(self.solved, log2_states)
+    def sets(self, log2_states: int) -> scoring.TrueSets:
+        return scoring.TrueSets.cached(self.solved, log2_states)
 
     def frontier(self) -> pd.DataFrame:
         _, entry = self.kept("aircraft_frontier", "frontier")
@@ -95,35 +89,35 @@ def the_margins(again: Again) -> None:
 def the_rollouts(again: Again) -> None:
     inputs = again.kept("rollouts", f"{TASK}-SafeMR-seed*")[1]["inputs"]
     certificate, task = certify.certificate_of_record(again.record(inputs["policy"]))
-    rollouts.measured(
+    trajectories.measured(
         again.measurements, certificate, task, layouts=inputs["layouts"], steps=inputs["steps"]
     )
 
 
 def unseen_layouts(again: Again) -> None:
     inputs = again.kept("unseen_layouts", f"{TASK}-SafeMR-seed0")[1]["inputs"]
-    evaluate.measured(
+    evaluation.measured(
         again.measurements, again.record(inputs), episodes=inputs["episodes"], seed=inputs["seed"]
     )
 
 
 def the_frontier(again: Again) -> None:
     inputs = again.kept("aircraft_frontier", "frontier")[1]["inputs"]
-    aircraft_evidence.measured_frontier(again.measurements, again.sets(inputs["log2_states"]))
+    scoring.measured_frontier(again.measurements, again.sets(inputs["log2_states"]))
 
 
 def learners_and_references(again: Again) -> None:
     inputs = again.kept("aircraft_learners", "Aircraft-SafeMR-seed0")[1]["inputs"]
     folder = again.record(inputs["policy"])
     runs, _ = records.read_records(again.root, [folder.relative_to(again.root)])
-    aircraft_evidence.compare(
+    scoring.compare(
         again.sets(inputs["log2_states"]), again.frontier(), again.root, runs, inputs["flights"]
     )
 
 
 def the_slices(again: Again) -> None:
     nothing_learned = pd.DataFrame({"kind": [], "variant": []})
-    aircraft_evidence.slices(again.sets(19), nothing_learned, again.measurements)
+    scoring.slices(again.sets(19), nothing_learned, again.measurements)
 
 
 def neural_energies(again: Again) -> None:
@@ -137,7 +131,7 @@ def neural_energies(again: Again) -> None:
     folders = sorted((again.record(policy) for policy in inputs["policies"]), key=place)
     runs, _ = records.read_records(again.root, [f.relative_to(again.root) for f in folders])
     config = json.loads((folders[0] / records.CONFIG).read_text())
-    neural_evidence.measured(
+    neural.measured(
         again.measurements, again.sets(inputs["log2_states"]), again.frontier(), again.root, runs,
         config["algorithm"]["hyperparameters"],
     )  # fmt: skip
@@ -213,7 +207,7 @@ def content(path: Path) -> Any:
     """What was measured; of flown courses their shapes and the first steps."""
     if path.suffix == ".json":
         return json.loads(path.read_text())["value"]
-    arrays = {name: values for name, values in data.load(path).items() if name != HEADER}
+    arrays = {name: values for name, values in files.load_arrays(path).items() if name != HEADER}
     for name in ("robot", "goal", "box", "reward", "cost_indicator", "goal_met"):
         whole = arrays.pop(f"episodes/{name}", None)
         if whole is not None:
@@ -223,7 +217,7 @@ def content(path: Path) -> Any:
 
 def test_every_kind_is_measured_again_by_some_case() -> None:
     kinds = [kind for _, made in CASES.values() for kind in made]
-    assert sorted(kinds) == sorted(measurements.VERSIONS)
+    assert sorted(kinds) == sorted(store.VERSIONS)
 
 
 @pytest.fixture(scope="module")
@@ -239,10 +233,10 @@ def test_the_repository_keeps_what_its_code_measures(
     """Otherwise VERSIONS was not raised with a change of the measuring code."""
     recorded, kinds = CASES[measure]
     measure(Again(recorded, tmp_path, solved))
-    made = {path.parent.name: path for path in (tmp_path / measurements.FOLDER).glob("*/*")}
+    made = {path.parent.name: path for path in (tmp_path / store.FOLDER).glob("*/*")}
     assert made.keys() == set(kinds)
     for kind, path in made.items():
-        kept = recorded / measurements.FOLDER / kind / path.name
+        kept = recorded / store.FOLDER / kind / path.name
         assert kept.exists(), f"{kind}: inputs or version are others than those kept: redraw"
         found = differences(content(path), content(kept))
         far = [(place, gap) for place, gap in found if gap > allowed(kind, place)]

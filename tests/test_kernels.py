@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from safemr import fused, kernels
 from safemr.algorithms import fac, joint_sis, sac_lagrangian, safemr
-from safemr.autograd import AutogradSteps
-from safemr.buffers import Batch, Replay
-from safemr.networks import ACTIVATIONS, StackedMLP
+from safemr.learning import numba_kernels, numba_steps
+from safemr.learning.networks import ACTIVATIONS, StackedMLP
+from safemr.learning.replay import Batch, Replay
+from safemr.learning.torch_steps import AutogradSteps
 
 MODULES = (fac, joint_sis, safemr, sac_lagrangian)
 OBSERVATIONS, ACTIONS, OBSTACLES, BATCH, PARTS = 5, 2, 3, 24, 4
@@ -134,7 +134,7 @@ def test_state_moves_between_backends() -> None:
 def test_choice_of_the_backend() -> None:
     """A device other than the CPU has no compiled kernels."""
     agent = make(fac, "fused")
-    assert type(agent.steps) is fused.FusedSteps
+    assert type(agent.steps) is numba_steps.FusedSteps
     assert type(make(fac, "torch").steps) is AutogradSteps
     agent.config = dataclasses.replace(agent.config, device="cuda")
     assert type(agent._make_steps()) is AutogradSteps
@@ -151,14 +151,14 @@ def test_gradients_of_a_stack(activation: str) -> None:
     out = stack(x)
     expected = torch.autograd.grad(out, [stack.parameters, x], grad)
 
-    net, inputs = fused.network(stack), x.detach().numpy()
+    net, inputs = numba_steps.network(stack), x.detach().numpy()
     slopes = grad.transpose(1, 2).contiguous().numpy()
     memory = np.empty(3 * (7 + 6) * 11, np.float32)
-    found = kernels.forward(net, inputs, memory)
+    found = numba_kernels.forward(net, inputs, memory)
     torch.testing.assert_close(torch.from_numpy(found).transpose(1, 2), out.detach())
-    flat = kernels.backward(net, inputs, memory, slopes)
+    flat = numba_kernels.backward(net, inputs, memory, slopes)
     torch.testing.assert_close(torch.from_numpy(flat), expected[0], rtol=1e-5, atol=1e-5)
-    columns = kernels.backward_inputs(net, memory, slopes, 2)
+    columns = numba_kernels.backward_inputs(net, memory, slopes, 2)
     torch.testing.assert_close(
         torch.from_numpy(columns).T, expected[1][:, 2:], rtol=1e-5, atol=1e-5
     )
@@ -170,7 +170,7 @@ def test_adam_is_that_of_torch() -> None:
     ours, reference = (torch.optim.Adam([values], lr=0.01) for values in (mine, theirs))
     for step in range(100):
         grad = torch.randn(50, generator=rng) * 10.0 ** (step % 5 - 3)
-        kernels.adam(mine.detach().numpy(), grad.numpy(), fused.optimiser(ours), 0.01)
+        numba_kernels.adam(mine.detach().numpy(), grad.numpy(), numba_steps.optimiser(ours), 0.01)
         theirs.grad = grad
         reference.step()
     torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-6)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from safemr.lagrange import Multiplier, MultiplierConfig, penalised
+from safemr.learning.lagrange import Multiplier, MultiplierConfig, penalised
 
 
 @pytest.mark.parametrize("initial", [1e-3, 1.0, 40.0])

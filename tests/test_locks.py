@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 from sample_record import CONFIG
 
-from safemr import checkpoints, records
-from safemr.checkpoints import RunSession
-from safemr.locks import LockedError, ProcessLock
+from safemr.experiment import checkpoints, records
+from safemr.experiment.checkpoints import RunSession
+from safemr.experiment.locks import LockedError, ProcessLock
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLDER = """

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from sample_record import make_record
 
-from safemr import measurements
 from safemr.errors import UserError
-from safemr.measurements import Measurements, record_inputs
+from safemr.measure import store
+from safemr.measure.store import Measurements, record_inputs
 
 KIND = "controllers"
 
@@ -64,7 +64,7 @@ def test_other_inputs_or_another_version_replace_what_was_kept(
     for seed in (1, 2, 2):
         kept.rows(KIND, "one", {"seed": seed}, measure)
     assert measure.calls == 2
-    monkeypatch.setitem(measurements.VERSIONS, KIND, measurements.VERSIONS[KIND] + 1)
+    monkeypatch.setitem(store.VERSIONS, KIND, store.VERSIONS[KIND] + 1)
     kept.rows(KIND, "one", {"seed": 2}, measure)
     assert measure.calls == 3
     names = sorted(path.name[:-18] for path in (kept.folder / KIND).iterdir())

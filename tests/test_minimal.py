@@ -18,8 +18,8 @@ import torch
 from toy import ToyEnvs
 
 from safemr.algorithms import safemr
-from safemr.buffers import Replay
-from safemr.evaluate import evaluate
+from safemr.learning.evaluation import evaluate
+from safemr.learning.replay import Replay
 from safemr.tasks import make_envs
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from safemr.mirror import Mirror
+from safemr.experiment.wandb_log import Mirror
 
 CONFIG = {"task": {"name": "Pillars-0.15-Goal"}, "seed": 100}
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from safemr.errors import UserError
-from safemr.networks import ACTIVATIONS, StackedMLP, squashed_gaussian
+from safemr.learning.networks import ACTIVATIONS, StackedMLP, squashed_gaussian
 
 PLAIN = {"elu": torch.nn.ELU, "relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}
 

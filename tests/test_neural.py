@@ -14,14 +14,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from envs.aircraft import AircraftVectorEnv, observe
-from safemr import aircraft, energy, neural_evidence, records, runs
+from safemr.aircraft import neural, unsafe_sets
+from safemr.aircraft.reachability import CONSTANT, Grid, Solution, solve
 from safemr.algorithms import neural_safemr
-from safemr.buffers import Batch
+from safemr.certificates import energy
 from safemr.conventions import COVERS
 from safemr.errors import UserError
-from safemr.plotting import aircraft as pictures
-from safemr.policies import Policy
-from safemr.reachability import CONSTANT, Grid, Solution, solve
+from safemr.experiment import planning, records
+from safemr.learning.policies import Policy
+from safemr.learning.replay import Batch
+from safemr.report.figures import aircraft as pictures
 
 ZETA = {"sigma": 0.06, "k": 1.0, "n": 1.0, "length_scale": 5.0}
 SMALL = {"num_envs": 4, "hidden": 16, "batch_size": 32, "start_steps": 200, **ZETA}
@@ -41,10 +43,10 @@ def states(count: int = 500) -> np.ndarray:
     return drawn
 
 
-def certificate(made: neural_safemr.Trainer) -> aircraft.Certificate:
+def certificate(made: neural_safemr.Trainer) -> unsafe_sets.Certificate:
     """As it is read from a policy file."""
     policy = Policy.from_arrays(made.policy.arrays())
-    return neural_evidence.recorded_certificate(CONSTANT, policy)
+    return neural.recorded_certificate(CONSTANT, policy)
 
 
 def filled(made: neural_safemr.Trainer, scale: float = 3.0) -> neural_safemr.Trainer:
@@ -90,7 +92,7 @@ def test_corrected_energy_is_a_soft_maximum_above_phi_0(phi, contact, correction
 
 def test_learning_starts_from_the_handcrafted_energy():
     made = trainer(smoothing=1e-3)
-    expected = aircraft.energy_certificate(CONSTANT, (0.06, 1.0, 1.0), 5.0)(states())
+    expected = unsafe_sets.energy_certificate(CONSTANT, (0.06, 1.0, 1.0), 5.0)(states())
     contact = 1.0 - CONSTANT.separation(states()) / 5.0
     found = certificate(made)(states())
     np.testing.assert_allclose(found, np.maximum(expected, contact), atol=1e-3)
@@ -195,23 +197,23 @@ def solution() -> Solution:
 
 
 @pytest.fixture(scope="module")
-def truth(solution: Solution) -> aircraft.Truth:
-    return aircraft.Truth.sample(solution, log2_count=13)
+def truth(solution: Solution) -> unsafe_sets.Truth:
+    return unsafe_sets.Truth.sample(solution, log2_count=13)
 
 
 @pytest.fixture(scope="module")
-def control(truth: aircraft.Truth) -> aircraft.Certificate:
-    return neural_evidence.fit_to_truth(truth, steps=600)
+def control(truth: unsafe_sets.Truth) -> unsafe_sets.Certificate:
+    return neural.fit_to_truth(truth, steps=600)
 
 
 def test_the_network_can_express_the_truth(truth, control):
     """What the frontier's certificates cannot: nearly the true volume at 5% missed."""
-    shifted = neural_evidence.shifted_to_miss(truth, control, 0.05)
-    metrics = aircraft.compare_certificate(truth, shifted, turns=3)
+    shifted = neural.shifted_to_miss(truth, control, 0.05)
+    metrics = unsafe_sets.compare_certificate(truth, shifted, turns=3)
     assert metrics.missed_share <= 0.05
     assert metrics.volume_ratio < 1.2
-    start = neural_evidence.fit_to_truth(truth, steps=0)
-    assert aircraft.compare_certificate(truth, start, turns=3).volume_ratio > 1.5
+    start = neural.fit_to_truth(truth, steps=0)
+    assert unsafe_sets.compare_certificate(truth, start, turns=3).volume_ratio > 1.5
 
 
 def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: Path):
@@ -219,7 +221,7 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
     for (variant, seed), one in made.items():
         described = {"name": "neural_safemr", "version": 1, "hyperparameters": {"eta": 0.0}}
         run: dict[str, Any] = {
-            **{"schema": 1, "task": runs.describe_task("Aircraft", {}), "algorithm": described},
+            **{"schema": 1, "task": planning.describe_task("Aircraft", {}), "algorithm": described},
             **{"seed": seed, "steps": 10, "log_every": 10},
             "evaluation": {"every": 10, "episodes": 1, "seed": 0},
         }
@@ -227,31 +229,31 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
         folder = tmp_path / records.record_path(run, variant)
         records.write_record(folder, run, variant, [row], {}, one.policy.arrays())
     index = records.read_records(tmp_path)[0]
-    rows = neural_evidence.compare(truth, solution, FRONTIER, tmp_path, index, control, flights=50)
+    rows = neural.compare(truth, solution, FRONTIER, tmp_path, index, control, flights=50)
     learners = rows[rows["kind"] == "learner"].set_index("seed")
     for (_, seed), one in made.items():
-        expected = aircraft.compare_certificate(truth, certificate(one), 0.0)
+        expected = unsafe_sets.compare_certificate(truth, certificate(one), 0.0)
         assert learners.loc[seed, "volume_ratio"] == expected.volume_ratio
         assert learners.loc[seed, "leak_share"] == expected.leak_share
-    fitted = rows[rows["variant"] == f"{neural_evidence.CONTROL}, shifted"].iloc[0]
+    fitted = rows[rows["variant"] == f"{neural.CONTROL}, shifted"].iloc[0]
     assert fitted["missed_share"] <= COVERS
     curve = rows[rows["kind"] == "control"]
     assert curve["volume_ratio"].is_monotonic_decreasing
-    assert (curve["missed_share"] <= np.array(neural_evidence.CONTROL_SHARES)).all()
+    assert (curve["missed_share"] <= np.array(neural.CONTROL_SHARES)).all()
 
     missing = pd.DataFrame([("Aircraft", "Neural-a9", 100)], columns=["task", "variant", "seed"])
-    table = neural_evidence.comparison_table(rows, missing)
+    table = neural.comparison_table(rows, missing)
     assert table.display["certificate"].tolist() == [
         "Neural-a1",
-        neural_evidence.CONTROL,
-        f"{neural_evidence.CONTROL}, shifted",
+        neural.CONTROL,
+        f"{neural.CONTROL}, shifted",
     ]
     assert table.display["seeds"].tolist()[0] == "2"
     assert "Neural-a9" in table.notes[0]
 
-    found = neural_evidence.recorded_certificates(CONSTANT, tmp_path, index)
+    found = neural.recorded_certificates(CONSTANT, tmp_path, index)
     assert [len(certificates) for certificates in found.values()] == [2]
-    x, y, cut = neural_evidence.slice_at(solution, found, spacing=0.5)
+    x, y, cut = neural.slice_at(solution, found, spacing=0.5)
     inside = np.hypot(*np.meshgrid(x, y, indexing="ij")) < CONSTANT.d_min
     assert all((claimed[inside] > 0).all() for claimed in cut.learned["Neural-a1"])
     figure = pictures.neural(x, y, cut, CONSTANT.d_min, FRONTIER, rows, COVERS)
@@ -266,4 +268,4 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
 def test_a_record_without_a_network_is_named(truth, solution, control, tmp_path: Path):
     index = pd.DataFrame([{"variant": "Silent", "seed": 1, "folder": "runs/none"}])
     with pytest.raises(UserError, match=r"certificate_parameters.*runs/none"):
-        neural_evidence.compare(truth, solution, FRONTIER, tmp_path, index, control, flights=10)
+        neural.compare(truth, solution, FRONTIER, tmp_path, index, control, flights=10)

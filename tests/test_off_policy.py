@@ -12,10 +12,10 @@ import torch
 from toy import ToyEnvs
 
 from safemr.algorithms import fac, joint_sis, safemr
-from safemr.buffers import Batch
 from safemr.errors import UserError
-from safemr.evaluate import evaluate
-from safemr.training import TrainingDivergedError
+from safemr.learning.contract import TrainingDivergedError
+from safemr.learning.evaluation import evaluate
+from safemr.learning.replay import Batch
 
 MODULES = (fac, joint_sis, safemr)
 DEVICES = ("cpu", *(("cuda",) if torch.cuda.is_available() else ()))
@@ -165,7 +165,7 @@ def test_every_device_of_this_machine_trains_and_resumes(device):
 
 @pytest.mark.parametrize("module", MODULES)
 def test_a_restored_trainer_continues_bit_for_bit(module, tmp_path):
-    from safemr import checkpoints
+    from safemr.experiment import checkpoints
 
     whole, part, rest = make(module), make(module), make(module)
     whole.advance(600)

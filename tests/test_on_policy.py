@@ -16,13 +16,13 @@ from toy import ToyEnvs, optimal_return
 
 from safemr.algorithms import cpo, ppo_lagrangian
 from safemr.algorithms.ppo_lagrangian import clipped_surrogate, policy_loss
-from safemr.config import load
 from safemr.errors import UserError
-from safemr.evaluate import evaluate
-from safemr.on_policy import Batch, explained_variance
-from safemr.policies import Policy
-from safemr.rollout import Rollout, gae, minibatches
-from safemr.runs import resolve
+from safemr.experiment.config import load
+from safemr.experiment.planning import resolve
+from safemr.learning.evaluation import evaluate
+from safemr.learning.on_policy import Batch, explained_variance
+from safemr.learning.policies import Policy
+from safemr.learning.rollouts import Rollout, gae, minibatches
 
 ALGORITHMS = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
 TOY: dict[str, Any] = {

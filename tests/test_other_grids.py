@@ -15,10 +15,12 @@ import pandas as pd
 import pytest
 from test_workflow import Checkout, checkout  # noqa: F401  a fixture
 
-from safemr import reference, runs, statistics
-from safemr.measurements import Measurements
-from safemr.plotting import scenes
-from safemr.plotting import scores as drawing
+from safemr import paper
+from safemr.experiment import planning
+from safemr.measure.store import Measurements
+from safemr.report import statistics
+from safemr.report.figures import scenes
+from safemr.report.figures import scores as drawing
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "workflow" / "scripts"
 GOAL = "Pillars-0.15-Goal"
@@ -67,14 +69,14 @@ def written(folder: Path, tasks: list[str], seeds: int = 3) -> dict[str, str]:
     return {name: str(folder / f"{name}.csv") for name in files}
 
 
-GRIDS = {**{name: [name] for name in runs.task_names()}, "Pillars-8": ["Pillars-8"]}
-GRIDS["all together"] = [*runs.task_names(), "Pillars-8", "Doors-Reach"]
+GRIDS = {**{name: [name] for name in planning.task_names()}, "Pillars-8": ["Pillars-8"]}
+GRIDS["all together"] = [*planning.task_names(), "Pillars-8", "Doors-Reach"]
 
 
 @pytest.mark.parametrize("tasks", GRIDS.values(), ids=GRIDS)
 def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> None:
     given = written(tmp_path, tasks)
-    paper = [task for task in tasks if task in reference.TABLE_I]
+    paper = [task for task in tasks if task in paper.TABLE_I]
     expected = pd.read_csv(given["runs"])[["task", "variant", "seed"]].to_numpy().tolist()
     grid = {"tasks": tasks, "variants": list(VARIANTS), "tolerance": 1.0, "clean_share": 0.95}
     names = ["return_against_cost"]
@@ -98,7 +100,7 @@ def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> Non
     run_script("claims", input=claims, params=params,
                output={"markdown": str(tmp_path / "claims.md")})  # fmt: skip
     verdicts = pd.read_csv(tmp_path / "claims.csv").set_index("claim")["verdict"]
-    for task in reference.TASKS:
+    for task in paper.TASKS:
         assert (verdicts[f"highest_return[{task}]"] == "not run") == (task not in tasks)
     if not paper and "Aircraft" not in tasks:
         assert set(verdicts) == {"not run"}
@@ -107,7 +109,7 @@ def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> Non
 def test_the_picture_of_the_tasks_shows_what_their_settings_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    registered = (*reference.TASKS, "PointGoal1")
+    registered = (*paper.TASKS, "PointGoal1")
     entries: list[dict[str, Any]] = [{"name": name, "settings": {}} for name in registered]
     entries.append({"name": "Pillars-8", **EIGHT})
     seen = {}
@@ -195,7 +197,7 @@ def test_one_task_alone_from_nothing_to_figures(checkout: Checkout, task: str) -
     no_fault(checkout.snakemake("all"))
     tables = checkout.folder / "results" / "tables"
     assert (tables / "certificates.md").exists() == (task != "Aircraft")
-    assert ("Paper" in (tables / "table1.md").read_text()) == (task in reference.TASKS)
+    assert ("Paper" in (tables / "table1.md").read_text()) == (task in paper.TASKS)
     assert "paper [" not in "".join(path.read_text() for path in tables.glob("certificates.md"))
     figures = {path.stem for path in (checkout.folder / "paper_figures").glob("*.png")}
     assert ("environments" in figures) == (task != "Aircraft")

@@ -12,10 +12,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from safemr import compute, records, statistics, tables
-from safemr.config import load
-from safemr.plotting import curves
-from safemr.runs import resolve
+from safemr.experiment import records
+from safemr.experiment.config import load
+from safemr.experiment.planning import resolve
+from safemr.report import compute, statistics, tables
+from safemr.report.figures import curves
 
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = ROOT / "examples/outside/cross_entropy.py"

@@ -12,10 +12,12 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from safemr import config, reference, sensitivity, statistics
+from safemr import files, paper
 from safemr.errors import UserError
-from safemr.plotting import certificate, curves, data, scenes, scores, style
-from safemr.reference import Zeta
+from safemr.experiment import config
+from safemr.paper import Zeta
+from safemr.report import sensitivity, statistics
+from safemr.report.figures import certificate, curves, scenes, scores, style
 
 TASKS = ("Pillars-0.15-Goal", "Hazards-0.15-Push")
 D_MIN = 0.25
@@ -41,7 +43,7 @@ def luminance(colour: str) -> np.ndarray:
 
 
 def test_algorithms_have_distinct_colours_and_unknown_ones_a_stable_one():
-    names = (*reference.ALGORITHMS, "SAC-L")
+    names = (*paper.ALGORITHMS, "SAC-L")
     tints = np.array([luminance(style.colour(name)) for name in names])
     gaps = np.abs(tints[:, None] - tints[None]).sum(-1) + 3 * np.eye(len(names))
     assert gaps.min() > 0.3
@@ -140,7 +142,7 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
     final = statistics.final_scores(progress)
     scale = dict.fromkeys(TASKS, 1.0)
     one = dict.fromkeys(TASKS[:1], 1.0)
-    zeta = reference.TABLE_II[reference.HEADLINE]
+    zeta = paper.TABLE_II[paper.HEADLINE]
     margins = pd.DataFrame(
         {"distance": [0.3, 0.3, 0.6, 0.6], "bearing": [0.0, 1.0, 0.0, 1.0],
          "margin": [-0.1, 0.1, -0.2, np.nan]}
@@ -174,7 +176,7 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
         ),
         "weights": lambda: scores.weight_map(sensitivity.weight_map(final, learned, weights).data),
         "parameters": lambda: curves.parameter_evolution(
-            progress, TASKS, fixed={"FAC-phih": reference.PHI_H._asdict()}
+            progress, TASKS, fixed={"FAC-phih": paper.PHI_H._asdict()}
         ),
         "return against cost": lambda: scores.return_against_cost(final, TASKS, tolerance=1.0),
         "aggregates": lambda: scores.aggregate_scores(
@@ -185,10 +187,10 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
         ),
         "energy": lambda: certificate.energy_and_safe_set(zeta, D_MIN),
         "passage": lambda: certificate.narrow_passage(
-            ("a", reference.PHI_H), ("b", zeta), D_MIN
+            ("a", paper.PHI_H), ("b", zeta), D_MIN
         ),
         "check": lambda: certificate.certificate_check(
-            {"phi_h": reference.PHI_H, "phi_0": reference.PHI_0}, D_MIN, margins, "phi_h"
+            {"phi_h": paper.PHI_H, "phi_0": paper.PHI_0}, D_MIN, margins, "phi_h"
         ),
         "multiplier": lambda: certificate.multiplier_maps({"t": plane}, ["t", "absent"]),
     }  # fmt: skip
@@ -229,11 +231,11 @@ def test_an_unsafe_algorithm_has_a_hollow_mean(progress):
 
 def test_the_weight_map_shows_every_point_where_it_belongs(progress):
     axes = figures(progress)["weights"]().axes
-    data = sensitivity.weight_map(
+    tracks = sensitivity.weight_map(
         statistics.final_scores(progress), progress.iloc[:0], {"mine": (0.3, 0.2)}
     ).data
     texts = {text.get_position(): text.get_text() for text in axes[0].texts}
-    assert texts[0, 1] == f"{data['return'].item():.1f}"
+    assert texts[0, 1] == f"{tracks['return'].item():.1f}"
     assert texts[1, 1] == "missing"
     frames = {round(patch.get_x()): to_hex(patch.get_edgecolor()) for patch in axes[0].patches}
     assert frames[1] == "#ffffff"  # CPO, above JointSIS
@@ -253,11 +255,11 @@ def test_admissible_speed_is_where_the_energy_vanishes():
     distances = np.array([0.5, 0.6, 0.8, 3.0])
     positions = np.stack([-distances, np.zeros(4)], -1)
     speed = certificate.admissible_speed(
-        positions, np.zeros((1, 2)), reference.PHI_H, D_MIN, np.array([1.0, 0.0])
+        positions, np.zeros((1, 2)), paper.PHI_H, D_MIN, np.array([1.0, 0.0])
     )
     np.testing.assert_allclose(speed, [np.nan, 0.36 - 0.3025, 0.64 - 0.3025, 1.5], atol=1e-12)
     away = certificate.admissible_speed(
-        -positions[1:], np.zeros((1, 2)), reference.PHI_H, D_MIN, np.array([1.0, 0.0])
+        -positions[1:], np.zeros((1, 2)), paper.PHI_H, D_MIN, np.array([1.0, 0.0])
     )
     np.testing.assert_allclose(away, 1.5)
 
@@ -265,10 +267,10 @@ def test_admissible_speed_is_where_the_energy_vanishes():
 def test_narrow_passage_is_closed_by_the_handcrafted_function_and_open_to_the_learned_one():
     obstacles, ahead = np.array([[0.0, 0.5], [0.0, -0.5]]), np.array([1.0, 0.0])
     line = np.stack([np.linspace(-1, 0, 201), np.zeros(201)], -1)
-    learned = reference.TABLE_II[reference.HEADLINE]
+    learned = paper.TABLE_II[paper.HEADLINE]
     closed, opened = (
         certificate.admissible_speed(line, obstacles, zeta, D_MIN, ahead)
-        for zeta in (reference.PHI_H, learned)
+        for zeta in (paper.PHI_H, learned)
     )
     assert np.isnan(closed).any()
     assert np.nanmin(opened) > 0.2
@@ -276,9 +278,9 @@ def test_narrow_passage_is_closed_by_the_handcrafted_function_and_open_to_the_le
 
 
 def test_radial_drives_show_both_conditions():
-    from safemr.energy import energy
+    from safemr.certificates.energy import energy
 
-    zeta = reference.TABLE_II[reference.HEADLINE]
+    zeta = paper.TABLE_II[paper.HEADLINE]
     inside = certificate.radial_drive(1.55, -1.0, zeta, D_MIN, 100)
     assert (energy(*inside.T, D_MIN, *zeta) <= 0).all()
     assert (inside[:, 0] > D_MIN).all()
@@ -321,13 +323,13 @@ def test_the_view_holds_the_box_that_was_pushed_out_of_the_square():
 
 def test_trajectories_state_the_return_and_draw_the_path(tmp_path):
     path = tmp_path / "rollouts.npz"
-    data.save(path, recording(0.0))
-    recorded = {"SafeMR": data.load(path), "JointSIS": recording(0.5)}
+    files.save_arrays(path, recording(0.0))
+    recorded = {"SafeMR": files.load_arrays(path), "JointSIS": recording(0.5)}
     figure = scenes.trajectories(recorded, draw_nothing, steps=10)
     assert len(figure.axes) == 4
     assert figure.axes[0].get_title() == "return 10.0"
-    tracks = [line for line in figure.axes[2].lines if line.get_color() == style.colour("JointSIS")]
-    np.testing.assert_allclose(tracks[0].get_xdata(), 0.5 + np.linspace(0, 0.5, 11), atol=1e-6)
+    paths = [line for line in figure.axes[2].lines if line.get_color() == style.colour("JointSIS")]
+    np.testing.assert_allclose(paths[0].get_xdata(), 0.5 + np.linspace(0, 0.5, 11), atol=1e-6)
 
 
 def test_animation_is_a_small_looping_gif(tmp_path):
@@ -345,4 +347,4 @@ def test_rollout_data_from_elsewhere_is_refused(tmp_path):
     path = tmp_path / "bad.npz"
     path.write_bytes(b"nothing")
     with pytest.raises(UserError, match=r"bad\.npz"):
-        data.load(path)
+        files.load_arrays(path)

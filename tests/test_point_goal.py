@@ -12,9 +12,9 @@ import envs  # noqa: F401  (registers the tasks)
 from envs.layout import sample_layout
 from envs.navigation_physics import compile_model
 from envs.tasks import NAVIGATION_TASKS, POINT_GOAL
-from safemr.config import load
-from safemr.observation import ObservationTransform
-from safemr.runs import resolve
+from safemr.experiment.config import load
+from safemr.experiment.planning import resolve
+from safemr.learning.observation import ObservationTransform
 
 FAR = 50.0  # m, out of the way
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 import envs  # noqa: F401  registers the tasks
-from safemr import runs
 from safemr.errors import UserError
-from safemr.policies import Policy
-from safemr.train import make_envs
-from safemr.training import environment_seed
+from safemr.experiment import planning
+from safemr.experiment.train import make_envs
+from safemr.learning.contract import environment_seed
+from safemr.learning.policies import Policy
 
 ROOT = Path(__file__).resolve().parents[1]
 TASK = {"name": "Pillars-0.15-Goal", "version": 1, "settings": {}}
@@ -27,7 +27,7 @@ FAMILIES = {
 
 @pytest.fixture(scope="module", params=FAMILIES)
 def policy(request: pytest.FixtureRequest) -> Policy:
-    algorithm = runs.load_algorithm(request.param)
+    algorithm = planning.load_algorithm(request.param)
     config = algorithm.hyperparameters(**FAMILIES[request.param])
     return algorithm.trainer(config, functools.partial(make_envs, TASK), 0, 1_000).policy
 
@@ -75,10 +75,10 @@ def test_environment_seeds_of_the_families_and_of_neighbouring_runs_are_apart() 
 
 
 def test_seeds_of_a_run_are_made_in_one_place() -> None:
-    """Every stream of a run comes from `safemr.training`."""
+    """Every stream of a run comes from `safemr.learning.contract`."""
     made = {
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "safemr").rglob("*.py")
         if "SeedSequence" in path.read_text(encoding="utf-8")
     }
-    assert made == {"safemr/training.py"}
+    assert made == {"safemr/learning/contract.py"}

@@ -9,12 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safemr.aircraft.reachability import (
+    ADVERSARIAL,
+    CASES,
+    CONSTANT,
+    Grid,
+    Solution,
+    load_or_solve,
+    solve,
+)
+from safemr.aircraft.reachability.barrier import boundary_error, sheets
+from safemr.aircraft.reachability.check import (
+    compare,
+    intersection_over_union,
+    main,
+    read_references,
+)
+from safemr.aircraft.reachability.oracle import open_loop_value
+from safemr.aircraft.reachability.solver import VALUE_RANGE
 from safemr.errors import UserError
-from safemr.reachability import ADVERSARIAL, CASES, CONSTANT, Grid, Solution, load_or_solve, solve
-from safemr.reachability.barrier import boundary_error, sheets
-from safemr.reachability.check import compare, intersection_over_union, main, read_references
-from safemr.reachability.oracle import open_loop_value
-from safemr.reachability.solver import VALUE_RANGE
 
 SLICES = Path(__file__).parent / "golden" / "aircraft" / "slices.npz"
 

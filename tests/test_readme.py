@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from safemr import readme
 from safemr.errors import UserError
+from safemr.report import documents
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -54,9 +54,9 @@ def test_the_tests_that_guard_the_runs_exist():
 
 
 def test_the_worked_example_is_an_algorithm_of_one_file():
-    from safemr import runs
+    from safemr.experiment import planning
 
-    assert runs.load_algorithm("sac_lagrangian").family == "off_policy"
+    assert planning.load_algorithm("sac_lagrangian").family == "off_policy"
     assert "SAC-L: {algorithm: sac_lagrangian}" in README
 
 
@@ -64,7 +64,9 @@ def test_the_worked_example_is_an_algorithm_of_one_file():
 def test_the_tables_in_a_document_are_those_of_the_pipeline(document):
     text = (ROOT / document).read_text()
     assert "<!-- table: results/tables/" in text
-    assert readme.with_tables(ROOT / document) == text, "run: python -m safemr.readme " + document
+    assert documents.with_tables(ROOT / document) == text, (
+        "run: python -m safemr.report.documents " + document
+    )
 
 
 def test_a_table_is_put_between_its_marks_and_nowhere_else(tmp_path):
@@ -74,12 +76,12 @@ def test_a_table_is_put_between_its_marks_and_nowhere_else(tmp_path):
         "before\n<!-- table: made.md -->\nold\n<!-- end of table -->\n\nbetween\n"
         "<!-- table: made.md -->\n<!-- end of table -->\nafter\n"
     )
-    assert readme.main(["--check", str(document)]) == 1
+    assert documents.main(["--check", str(document)]) == 1
     assert "old" in document.read_text()
-    assert readme.main([str(document)]) == 0
+    assert documents.main([str(document)]) == 0
     block = "<!-- table: made.md -->\n| a\\1 |\n<!-- end of table -->\n"
     assert document.read_text() == f"before\n{block}\nbetween\n{block}after\n"
-    assert readme.main(["--check", str(document)]) == 0
+    assert documents.main(["--check", str(document)]) == 0
     (tmp_path / "made.md").unlink()
     with pytest.raises(UserError, match=r"made\.md cannot be read.*named in"):
-        readme.main([str(document)])
+        documents.main([str(document)])

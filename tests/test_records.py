@@ -17,9 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_record import CONFIG, POLICY, make_record
 
-from safemr import certify, evaluate, inspection, records
-from safemr.checkpoints import RunSession
-from safemr.records import RecordError
+from safemr.experiment import overview, records
+from safemr.experiment.checkpoints import RunSession
+from safemr.experiment.records import RecordError
+from safemr.learning import evaluation
+from safemr.measure import certify
 
 
 @pytest.fixture
@@ -188,7 +190,7 @@ def test_nothing_but_a_record_is_ever_advised_to_be_removed(record: Path, tmp_pa
     for kind, folder in foreign_folders(tmp_path, record).items():
         for read in (
             records.verify_record,
-            evaluate.evaluate_record,
+            evaluation.evaluate_record,
             certify.certificate_of_record,
         ):
             with pytest.raises(RecordError) as caught:
@@ -249,12 +251,12 @@ def test_writing_again_after_a_crash_in_between(record: Path, tmp_path: Path) ->
 def test_inspection_names_faults_and_unfinished_runs(
     record: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert inspection.main([str(tmp_path)]) == 0
+    assert overview.main([str(tmp_path)]) == 0
     with RunSession({**CONFIG, "seed": 101}, "FAC-phih", tmp_path) as session:
         session.resume()
         session.fail("critic_loss became inf at step 10")
     edit("progress.csv", lambda t: "")(record)
-    assert inspection.main([str(tmp_path)]) == 1
+    assert overview.main([str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     assert str(record) in printed
     assert "FAC-phih Pillars-0.15-Goal seed 101" in printed

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from kills import Outcome, attempt, equal_rows, finish, killed, make_run, outcome, short_run
 
-from safemr import runs
+from safemr.experiment import planning
 
 # Overrides that let every branch of an algorithm run within 600 steps.
 SMALL: dict[str, dict[str, Any]] = {
@@ -22,19 +22,19 @@ SMALL: dict[str, dict[str, Any]] = {
 }
 
 
-def small_run(name: str, steps: int = 1200, task: str = "Hazards-0.15-Push") -> runs.Run:
-    algorithm = runs.load_algorithm(name)
+def small_run(name: str, steps: int = 1200, task: str = "Hazards-0.15-Push") -> planning.Run:
+    algorithm = planning.load_algorithm(name)
     fields = algorithm.hyperparameters.__dataclass_fields__
     overrides = {k: v for k, v in SMALL[algorithm.family].items() if k in fields}
     return make_run(name, task, overrides, steps, points=12, evaluations=4)
 
 
-def uninterrupted(run: runs.Run, root: Path) -> tuple[Outcome, float]:
+def uninterrupted(run: planning.Run, root: Path) -> tuple[Outcome, float]:
     begun = time.monotonic()
     return finish(run, root), time.monotonic() - begun
 
 
-def interrupted(run: runs.Run, root: Path, duration: float, kills: int, seed: int) -> None:
+def interrupted(run: planning.Run, root: Path, duration: float, kills: int, seed: int) -> None:
     """Kill the run at ``kills`` random moments of its life, then let it finish."""
     generator, window, hits = random.Random(seed), 0.6 * duration, 0
     while hits < kills:
@@ -70,7 +70,7 @@ def test_kills_at_random_moments(name: str, tmp_path: Path) -> None:
     assert outcome(run, tmp_path / "killed") == whole
 
 
-EVERY_ALGORITHM = [("Hazards-0.15-Push", name) for name in runs.algorithm_names()]
+EVERY_ALGORITHM = [("Hazards-0.15-Push", name) for name in planning.algorithm_names()]
 
 
 @pytest.mark.slow
@@ -88,7 +88,7 @@ def test_many_kills_of_every_algorithm(task: str, name: str, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("task", "name", "overrides"),
     [
-        *(("Pillars-0.15-Goal", name, {}) for name in runs.algorithm_names()),
+        *(("Pillars-0.15-Goal", name, {}) for name in planning.algorithm_names()),
         ("Hazards-0.30-Push", "safemr", {}),
         ("Pillars-0.15-Goal", "safemr", {"backend": "torch"}),
         ("Aircraft", "safemr", {}),

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from safemr import rollouts
-from safemr.energy import energy, largest
+from safemr import files
+from safemr.certificates.energy import energy, largest
+from safemr.certificates.falsification import make_simulator
 from safemr.errors import UserError
-from safemr.evaluate import evaluate
-from safemr.falsification import make_simulator
-from safemr.networks import StackedMLP
-from safemr.observation import ObservationTransform
-from safemr.plotting import data
-from safemr.policies import Policy, network_arrays
-from safemr.reference import PHI_H
+from safemr.learning.evaluation import evaluate
+from safemr.learning.networks import StackedMLP
+from safemr.learning.observation import ObservationTransform
+from safemr.learning.policies import Policy, network_arrays
+from safemr.measure import tracks, trajectories
+from safemr.paper import PHI_H
 
 TASK = "Pillars-0.15-Goal"
 LAYOUT = {"name": "Short", "base": TASK, "settings": {"max_episode_steps": 60}}
@@ -34,15 +34,15 @@ def policy() -> Policy:
 
 
 def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
-    recorded = rollouts.episodes(policy, LAYOUT, seeds=[5, 6, 7], steps=60)
+    recorded = trajectories.episodes(policy, LAYOUT, seeds=[5, 6, 7], steps=60)
     envs = make_simulator(LAYOUT, 3)
     scores = evaluate(policy, envs, seed=5)
     envs.close()
     assert recorded["reward"].sum(0).mean() == pytest.approx(scores["return"], abs=1e-5)
     assert recorded["robot"].shape == (61, 3, 3)
-    data.save(tmp_path / "a.npz", recorded)
-    loaded = data.load(tmp_path / "a.npz")
-    scene = data.scene_at(loaded, episode=1, step=60)
+    files.save_arrays(tmp_path / "a.npz", recorded)
+    loaded = files.load_arrays(tmp_path / "a.npz")
+    scene = tracks.scene_at(loaded, episode=1, step=60)
     np.testing.assert_array_equal(scene.robot, recorded["robot"][60, 1])
     assert scene.box is None
     assert scene.task.d_min == pytest.approx(0.25)
@@ -50,26 +50,26 @@ def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
 
 def test_no_more_steps_than_an_episode_has(policy):
     with pytest.raises(UserError, match="60 steps, 61 were asked"):
-        rollouts.episodes(policy, LAYOUT, seeds=[0], steps=61)
+        trajectories.episodes(policy, LAYOUT, seeds=[0], steps=61)
 
 
 def test_the_vase_is_recorded_where_there_is_one():
     envs = make_simulator("PointGoal1", 1)
     transform = ObservationTransform.for_layout(envs.observation_layout)
     actor = StackedMLP(1, (transform.dim, 8, 4), "elu", generator=torch.Generator().manual_seed(0))
-    recorded = rollouts.episodes(
+    recorded = trajectories.episodes(
         Policy(transform, actor, squash=True), "PointGoal1", seeds=[5], steps=3
     )
     envs.reset(seed=[5])
     np.testing.assert_allclose(
-        data.scene_at(recorded, episode=0, step=0).vase, envs.scene(0).vase, atol=1e-6
+        tracks.scene_at(recorded, episode=0, step=0).vase, envs.scene(0).vase, atol=1e-6
     )
     envs.close()
 
 
 def test_multiplier_map_is_the_energy_of_a_moving_robot_around_the_obstacles(policy):
     speed, heading = 0.5, 0.7
-    plane = rollouts.multiplier_map(
+    plane = trajectories.multiplier_map(
         policy, PHI_H, TASK, seed=2, points=21, speed=speed, heading=heading
     )
     x, y = np.meshgrid(plane["x"], plane["y"])
@@ -90,4 +90,4 @@ def test_multiplier_map_is_the_energy_of_a_moving_robot_around_the_obstacles(pol
 def test_a_policy_without_multiplier_is_refused(policy):
     bare = Policy(policy.transform, policy.network, squash=True)
     with pytest.raises(UserError, match="without a multiplier"):
-        rollouts.multipliers(bare, np.zeros((1, 44)))
+        trajectories.multipliers(bare, np.zeros((1, 44)))

@@ -8,9 +8,9 @@ import torch
 from toy import ToyEnvs, optimal_return
 
 from safemr.algorithms.sac_lagrangian import ENERGY_FIELDS, Agent, Config, Trainer, cost_target
-from safemr.buffers import Batch
 from safemr.errors import UserError
-from safemr.evaluate import evaluate
+from safemr.learning.evaluation import evaluate
+from safemr.learning.replay import Batch
 
 
 def test_cost_target_by_hand():

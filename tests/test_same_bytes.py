@@ -17,10 +17,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from envs import drawing
-from safemr import energy, feasibility, reference
-from safemr.plotting import aircraft, certificate, style
+from safemr import paper
+from safemr.certificates import energy, feasibility
+from safemr.report.figures import aircraft, certificate, style
 
-LEARNED = reference.TABLE_II[reference.HEADLINE]
+LEARNED = paper.TABLE_II[paper.HEADLINE]
 D_MIN = 0.25
 
 
@@ -41,14 +42,14 @@ def energy_and_safe_set() -> Figure:
 
 
 def narrow_passage() -> Figure:
-    pair = (("handcrafted", reference.PHI_H), ("learned", LEARNED))
+    pair = (("handcrafted", paper.PHI_H), ("learned", LEARNED))
     return certificate.narrow_passage(*pair, D_MIN)
 
 
 @style.styled
 def requirement() -> Figure:
     figure = style.new_figure(3, 2)
-    zetas = {"paper": LEARNED, "phi_h": reference.PHI_H}
+    zetas = {"paper": LEARNED, "phi_h": paper.PHI_H}
     certificate.draw_requirement(zetas, D_MIN, figure.subplots())
     return figure
 
@@ -89,7 +90,7 @@ def test_thresholds_are_not_decided_by_the_last_bits(monkeypatch):
         monkeypatch.setattr(certificate, "energy", disturbed(energy.energy, seed))
         speeds.append(
             certificate.admissible_speed(
-                positions, np.zeros((1, 2)), reference.PHI_H, D_MIN, np.array([1.0, 0.0])
+                positions, np.zeros((1, 2)), paper.PHI_H, D_MIN, np.array([1.0, 0.0])
             )
         )
     np.testing.assert_allclose(speeds, [[0.0, certificate.ROBOT.max_speed, 0.0]] * 20, atol=1e-9)

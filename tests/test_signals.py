@@ -18,11 +18,11 @@ import pytest
 from kills import make_run
 from sample_record import CONFIG, POLICY, ROWS
 
-from safemr import checkpoints, records, runs
-from safemr.checkpoints import RunSession
 from safemr.errors import tell
-from safemr.locks import ProcessLock
-from safemr.signals import StoppedError
+from safemr.experiment import checkpoints, planning, records
+from safemr.experiment.checkpoints import RunSession
+from safemr.experiment.locks import ProcessLock
+from safemr.experiment.signals import StoppedError
 
 ROOT = Path(__file__).resolve().parents[1]
 TERM, INT, HUP = signal.SIGTERM, signal.SIGINT, signal.SIGHUP
@@ -169,7 +169,7 @@ class Quoted(str):
         return shlex.quote(self) if form == "q" else str(self)
 
 
-def rule_line(run: runs.Run, root: Path, log: Path) -> str:
+def rule_line(run: planning.Run, root: Path, log: Path) -> str:
     """The command of the rule `train`, as Snakemake would give it to bash."""
     text = (ROOT / "workflow/rules/train.smk").read_text().partition("    shell:\n")[2]
     command: str = ast.literal_eval(f"({text})")
@@ -238,7 +238,7 @@ def test_the_last_line_reaches_the_log(started: Any) -> None:
 @pytest.mark.parametrize("number", [TERM, INT])
 def test_a_process_that_waits_ends_at_once_with_one_line(number: int, tmp_path: Path) -> None:
     arguments = ["--task", "Pillars-0.15-Goal", "--algorithm", "fac", "--steps", "1000", "--wait"]
-    from safemr import train
+    from safemr.experiment import train
 
     config, _ = train.resolve(train._parse(arguments))
     owner = ProcessLock(
@@ -246,7 +246,7 @@ def test_a_process_that_waits_ends_at_once_with_one_line(number: int, tmp_path: 
     )
     owner.acquire(wait=False)
     with subprocess.Popen(
-        [sys.executable, "-m", "safemr.train", *arguments, "--out", str(tmp_path)],
+        [sys.executable, "-m", "safemr.experiment.train", *arguments, "--out", str(tmp_path)],
         cwd=ROOT,
         stderr=subprocess.PIPE,
         text=True,

@@ -19,10 +19,11 @@ import pytest
 import torch
 from kills import short_run
 
-from safemr import checkpoints, fused, kernels, runs
-from safemr.networks import StackedMLP
-from safemr.observation import ObservationTransform
-from safemr.train import make_envs
+from safemr.experiment import checkpoints, planning
+from safemr.experiment.train import make_envs
+from safemr.learning import numba_kernels, numba_steps
+from safemr.learning.networks import StackedMLP
+from safemr.learning.observation import ObservationTransform
 
 OURS = ("safemr.", "envs.", "torch.optim.")
 # Attributes that hold nothing from one log point to the next (an epoch's samples), or must differ
@@ -79,9 +80,9 @@ def layout(array: Any) -> tuple[Any, ...]:
     )
 
 
-def trainer_of(run: runs.Run) -> Any:
+def trainer_of(run: planning.Run) -> Any:
     config = run.config
-    algorithm = runs.load_algorithm(config["algorithm"]["name"])
+    algorithm = planning.load_algorithm(config["algorithm"]["name"])
     return algorithm.trainer(
         algorithm.hyperparameters(**config["algorithm"]["hyperparameters"]),
         functools.partial(make_envs, config["task"]),
@@ -90,7 +91,7 @@ def trainer_of(run: runs.Run) -> Any:
     )
 
 
-NAVIGATION = [(name, "Pillars-0.15-Goal", {}) for name in runs.algorithm_names()]
+NAVIGATION = [(name, "Pillars-0.15-Goal", {}) for name in planning.algorithm_names()]
 OTHERS = [
     ("safemr", "Hazards-0.15-Push", {"backend": "torch"}),
     ("safemr", "Aircraft", {}),
@@ -120,7 +121,7 @@ def test_arrays_are_laid_out_as_before(
 @pytest.mark.parametrize("task", ["Pillars-0.15-Goal", "Aircraft"])
 def test_the_transform_decides_the_order(task: str, dtype: Any, order: Any) -> None:
     """Whatever the environment's own order, what the networks see has its columns one by one."""
-    layout = make_envs(runs.describe_task(task, {}), 1).observation_layout
+    layout = make_envs(planning.describe_task(task, {}), 1).observation_layout
     transform = ObservationTransform.for_layout(layout)
     width = max(part.stop for part in layout.values())
     raw = np.random.default_rng(0).normal(size=(16, width)).astype(dtype)
@@ -164,16 +165,18 @@ def test_results_do_not_depend_on_where_arrays_begin(order: Any, hidden: int) ->
         for offset in OFFSETS:
             parameters = [placed(n.parameters.detach().numpy(), offset) for n in (policy, critics)]
             networks = [
-                fused.network(n)._replace(parameters=p)
+                numba_steps.network(n)._replace(parameters=p)
                 for n, p in zip((policy, critics), parameters, strict=True)
             ]
             inputs, perturbation = placed(observations, offset), placed(noise, offset)
             with torch.no_grad():
                 evaluated = policy(torch.from_numpy(inputs)).numpy()
-            actions, densities = kernels.sample(networks[0], inputs, perturbation)
+            actions, densities = numba_kernels.sample(networks[0], inputs, perturbation)
             moments = [placed(np.zeros_like(parameters[1]), offset) for _ in range(2)]
-            adam = kernels.Optimiser(*moments, np.zeros(1, np.float32))
-            kernels.critic_step(networks[1], adam, 1e-3, inputs, actions, placed(targets, offset))
+            adam = numba_kernels.Optimiser(*moments, np.zeros(1, np.float32))
+            numba_kernels.critic_step(
+                networks[1], adam, 1e-3, inputs, actions, placed(targets, offset)
+            )
             results = (evaluated, actions, densities, parameters[1], *moments)
             found.append([result.tobytes() for result in results])
         assert all(result == found[0] for result in found[1:]), (batch, width)

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from safemr import statistics
 from safemr.errors import UserError
+from safemr.report import statistics
 
 FIVE = np.array([17.3, 15.9, 16.8, 19.1, 14.2])
 OTHER = np.array([12.1, 13.5, 11.0, 12.9, 14.4])

@@ -8,7 +8,8 @@ import pytest
 from sample_scores import OTHER, RETURNS, TASK, expected_runs, score_rows
 from scipy import stats
 
-from safemr import comparisons, compute, reference, sensitivity, statistics, tables
+from safemr import paper
+from safemr.report import compute, differences, sensitivity, statistics, tables
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_a_baseline_that_is_added_counts_in_table_one(scores):
 
 
 def test_differences_compare_every_two_algorithms_of_a_task_once(scores):
-    table = comparisons.differences(scores)
+    table = differences.differences(scores)
     pairs = table.data.set_index(["task", "variant", "other"])
     assert len(pairs) == 5 * 4 // 2 + 1
     gap = pairs.loc[(TASK, "JointSIS", "SafeMR")]
@@ -87,7 +88,7 @@ def test_differences_compare_every_two_algorithms_of_a_task_once(scores):
 
 
 def test_only_the_first_printed_improvement_of_the_paper_is_wrong():
-    wrong = [t for t, r in reference.TABLE_I.items()
+    wrong = [t for t, r in paper.TABLE_I.items()
              if abs(r.printed_improvement - r.improvement) > 0.06]  # fmt: skip
     assert wrong == ["Pillars-0.15-Goal"]
 
@@ -138,9 +139,9 @@ def test_no_run_at_all_still_makes_every_table(scores):
         tables.table_one(nothing, missing=missing),
         tables.full_results(nothing, missing=missing),
         tables.push_split(nothing, [OTHER], missing=missing),
-        comparisons.differences(nothing, missing=missing),
-        sensitivity.table_two(nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
-        sensitivity.weight_map(nothing, nothing, {"SafeMR": reference.HEADLINE}, missing=missing),
+        differences.differences(nothing, missing=missing),
+        sensitivity.table_two(nothing, {"SafeMR": paper.HEADLINE}, missing=missing),
+        sensitivity.weight_map(nothing, nothing, {"SafeMR": paper.HEADLINE}, missing=missing),
     ):
         assert "Runs missing" in table.markdown()
 
@@ -237,7 +238,7 @@ def test_nothing_of_the_paper_stands_beside_a_task_that_it_did_not_run(scores):
          for task in (TASK, OTHER) for seed in range(3) for name in ("sigma", "k", "n")],
         columns=["task", "variant", "seed", "metric", "value"],
     )  # fmt: skip
-    points = {"SafeMR": reference.HEADLINE}
+    points = {"SafeMR": paper.HEADLINE}
     for task, papers in ((TASK, True), (OTHER, False)):
         table = sensitivity.table_two(learned, points, task=task)
         assert ("paper" in set(table.data["seed"])) == papers
@@ -250,7 +251,7 @@ def test_two_seeds_leave_out_the_half_width_rather_than_call_it_missing():
          for seed in (0, 1) for name in ("sigma", "k", "n")],
         columns=["task", "variant", "seed", "metric", "value"],
     )  # fmt: skip
-    table = sensitivity.table_two(learned, {"SafeMR": reference.HEADLINE})
+    table = sensitivity.table_two(learned, {"SafeMR": paper.HEADLINE})
     assert tables.MISSING not in table.markdown()
     assert set(table.data["seed"]) == {"0", "1", "mean", "paper"}
 

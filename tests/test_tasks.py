@@ -10,10 +10,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from safemr import config, falsification, plan_cache, records, reference, runs, tasks, train
+from safemr import paper, tasks
+from safemr.certificates import falsification
+from safemr.certificates.falsification import make_simulator
 from safemr.errors import UserError
-from safemr.falsification import make_simulator
-from safemr.reference import PHI_H
+from safemr.experiment import config, plan_cache, planning, records, train
+from safemr.paper import PHI_H
 
 ROOT = Path(__file__).resolve().parents[1]
 GOAL, PUSH = "Pillars-0.15-Goal", "Hazards-0.15-Push"
@@ -32,8 +34,8 @@ def small(**changes: Any) -> dict[str, Any]:
     }
 
 
-def resolve(**changes: Any) -> runs.Plan:
-    return runs.resolve(config.parse(small(**changes)))
+def resolve(**changes: Any) -> planning.Plan:
+    return planning.resolve(config.parse(small(**changes)))
 
 
 def test_a_task_and_one_with_other_settings_fit_in_one_configuration() -> None:
@@ -111,11 +113,11 @@ def test_what_a_task_has_is_no_question_of_its_name() -> None:
         "Far-Push": {"base": GOAL, "settings": {"extent": 3.0}},
         "Slow-Goal": {"base": "Aircraft", "settings": {"other_turn": 0.5}},
     }
-    everything = [*runs.task_names(), *({name: entry} for name, entry in named.items())]
+    everything = [*planning.task_names(), *({name: entry} for name, entry in named.items())]
     plan = resolve(tasks=everything)
     robots = {name for name, task in plan.tasks.items() if task.traits.point_robot}
     boxes = {name for name, task in plan.tasks.items() if task.traits.pushes_box}
-    assert robots == {*reference.TASKS, "PointGoal1", "Doors-Reach", "Far-Push"}
+    assert robots == {*paper.TASKS, "PointGoal1", "Doors-Reach", "Far-Push"}
     assert boxes == {PUSH, "Hazards-0.30-Push", "Doors-Reach"}
     assert plan.tasks["Doors-Reach"].traits.episode_steps == 70
 
@@ -124,7 +126,7 @@ def test_a_remembered_plan_keeps_what_tasks_have(tmp_path: Path, monkeypatch: An
     monkeypatch.chdir(tmp_path)
     parsed = config.parse(small())
     first = plan_cache.plan_for(parsed)
-    monkeypatch.setattr(runs, "resolve", None)
+    monkeypatch.setattr(planning, "resolve", None)
     assert plan_cache.plan_for(parsed) == first
 
 
@@ -144,8 +146,8 @@ def test_an_environment_is_made_from_the_entry_of_a_record() -> None:
     assert envs.scene(0).obstacles.shape == (8, 2)
     assert envs.task.name == GOAL
     envs.close()
-    assert runs.installed(entry) == entry
-    assert runs.installed(GOAL) == {"name": GOAL, "version": 1, "settings": {}}
+    assert planning.installed(entry) == entry
+    assert planning.installed(GOAL) == {"name": GOAL, "version": 1, "settings": {}}
     with pytest.raises(UserError, match="Slow is none"):
         make_simulator({"name": "Slow", "base": "Aircraft", "settings": {}})
 
@@ -181,7 +183,7 @@ def test_the_command_line_names_a_task_as_the_configuration_does() -> None:
 
 
 def test_every_registered_task_is_described_by_its_own_environment() -> None:
-    for name in runs.task_names():
+    for name in planning.task_names():
         envs = tasks.make_envs(name, 1)
         alone = gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped
         assert tasks.traits(envs).point_robot == tasks.traits(alone).point_robot

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safemr.gaussian import GaussianActor, entropy, kl_divergence, log_density
-from safemr.networks import StackedMLP
-from safemr.trust_region import (
+from safemr.learning.gaussian import GaussianActor, entropy, kl_divergence, log_density
+from safemr.learning.networks import StackedMLP
+from safemr.learning.trust_region import (
     TrustRegionConfig,
     conjugate_gradient,
     fisher_vector_product,

@@ -12,13 +12,17 @@ import pytest
 from sample_record import CONFIG, ROWS, make_record
 from scipy import stats
 
-from safemr import cli, evaluate, records, statistics, unseen
+from safemr import cli
 from safemr.errors import UserError
-from safemr.measurements import Measurements
-from safemr.networks import StackedMLP
-from safemr.observation import ObservationTransform
-from safemr.policies import Policy
-from safemr.train import make_envs
+from safemr.experiment import records
+from safemr.experiment.train import make_envs
+from safemr.learning import evaluation
+from safemr.learning.networks import StackedMLP
+from safemr.learning.observation import ObservationTransform
+from safemr.learning.policies import Policy
+from safemr.measure import unseen_layouts
+from safemr.measure.store import Measurements
+from safemr.report import statistics
 
 TASK = "Pillars-0.15-Goal"
 
@@ -41,12 +45,12 @@ def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_record_flies_like_its_policy_and_is_measured_once(record: Path, tmp_path: Path) -> None:
     kept = Measurements(tmp_path)
-    scores = unseen.measured_scores(kept, [record], episodes=2, seed=20_000)
+    scores = unseen_layouts.measured_scores(kept, [record], episodes=2, seed=20_000)
     found = scores.set_index("metric")["value"]
     envs = make_envs(CONFIG["task"], 2)
-    from safemr.policies import load_policy
+    from safemr.learning.policies import load_policy
 
-    alone = evaluate.evaluate(load_policy(record), envs, 20_000)
+    alone = evaluation.evaluate(load_policy(record), envs, 20_000)
     envs.close()
     assert found["eval_return"] == alone["return"]
     assert found["eval_cost_indicator"] == alone["cost_indicator"]
@@ -56,7 +60,7 @@ def test_a_record_flies_like_its_policy_and_is_measured_once(record: Path, tmp_p
     }
     (path,) = (kept.folder / "unseen_layouts").iterdir()
     before = path.stat().st_mtime_ns
-    again = unseen.measured_scores(kept, [record], episodes=2, seed=20_000)
+    again = unseen_layouts.measured_scores(kept, [record], episodes=2, seed=20_000)
     pd.testing.assert_frame_equal(again, scores)
     assert path.stat().st_mtime_ns == before
 
@@ -75,9 +79,9 @@ def test_a_record_without_a_policy_is_named(
 ) -> None:
     folder = make_record(tmp_path)
     with pytest.raises(UserError, match="not a policy"):
-        evaluate.evaluate_record(folder, episodes=1)
+        evaluation.evaluate_record(folder, episodes=1)
     (folder / "policy.npz").unlink()
-    scores = unseen.measured_scores(Measurements(tmp_path), [folder], episodes=1, seed=0)
+    scores = unseen_layouts.measured_scores(Measurements(tmp_path), [folder], episodes=1, seed=0)
     assert scores.empty
     assert str(folder) in capsys.readouterr().out
 
@@ -112,7 +116,7 @@ def score_table(**values: list[float]) -> pd.DataFrame:
 def test_the_table_counts_episodes_with_violations() -> None:
     flown = score_table(SafeMR=[10.0, 11.0, 12.0], CPO=[20.0, 20.0, 20.0])
     before = score_table(SafeMR=[9.0, 9.0, 9.0])
-    data = unseen.table(flown, before, episodes=20).data.set_index("variant")
+    data = unseen_layouts.table(flown, before, episodes=20).data.set_index("variant")
     ours, cpo = data.loc["SafeMR"], data.loc["CPO"]
     assert (ours["violating_episodes"], ours["episodes"], ours["safe"]) == (0, 60, True)
     assert (cpo["violating_episodes"], cpo["episodes"], cpo["safe"]) == (6, 60, False)

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from safemr import catalogue, strict_yaml
 from safemr.errors import UserError
+from safemr.experiment import catalogue, strict_yaml
 
 
 @pytest.mark.parametrize(

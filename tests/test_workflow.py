@@ -20,8 +20,8 @@ from typing import Any
 import pytest
 import yaml
 
-from safemr import config, inspection, records, runs
-from safemr.locks import ProcessLock
+from safemr.experiment import config, overview, planning, records
+from safemr.experiment.locks import ProcessLock
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("Snakefile", "config", "envs", "safemr", "workflow")
@@ -59,9 +59,9 @@ class Checkout:
             yaml.safe_dump({**GRID, **changes}, sort_keys=False)
         )
 
-    def plan(self) -> runs.Plan:
+    def plan(self) -> planning.Plan:
         """The plan of the checkout, by this repository's own sources."""
-        return runs.resolve(config.load([self.folder / "config/config.yaml"]))
+        return planning.resolve(config.load([self.folder / "config/config.yaml"]))
 
     def start(self, *arguments: str, log: str | None = None) -> subprocess.Popen[str]:
         """Snakemake in a process group of its own, as a terminal would start it."""
@@ -160,15 +160,15 @@ def test_an_edit_makes_again_what_depends_on_it_and_only_that(checkout: Checkout
     assert checkout.scheduled(targets=made) == {}
     everything = {"aggregate": 1, "controllers": 1, **dict.fromkeys(made, 1)}
     for source, expected in {
-        "safemr/plotting/certificate.py": {"illustrations": 1},
+        "safemr/report/figures/certificate.py": {"illustrations": 1},
         "envs/drawing.py": {"illustrations": 1},
-        "safemr/comparisons.py": {"table_1": 1},
-        "safemr/plotting/curves.py": {"training_curves": 1},
+        "safemr/report/differences.py": {"table_1": 1},
+        "safemr/report/figures/curves.py": {"training_curves": 1},
         "envs/assets/point.xml": {"illustrations": 1, "controllers": 1, "table_1": 1},
-        "safemr/records.py": everything,
+        "safemr/experiment/records.py": everything,
         "safemr/algorithms/fac.py": {},
-        "safemr/off_policy.py": {},
-        "safemr/claims.py": {},
+        "safemr/learning/off_policy.py": {},
+        "safemr/report/claims.py": {},
     }.items():
         path = checkout.folder / source
         before, times = path.read_text(), (path.stat().st_atime, path.stat().st_mtime)
@@ -412,7 +412,7 @@ def test_a_diverging_run_stops_alone(checkout: Checkout) -> None:
                 if records.is_complete(checkout.folder / "results" / run.path)}  # fmt: skip
     assert recorded == set(GRID["algorithms"])
     assert printed.count("error: Lost Pillars-0.15-Goal seed 100: ") == 1
-    (line,) = inspection.unfinished(checkout.folder / "results")
+    (line,) = overview.unfinished(checkout.folder / "results")
     assert line.startswith("Lost Pillars-0.15-Goal seed 100")
     assert "failed: " in line
 

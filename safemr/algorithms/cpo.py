@@ -32,9 +32,9 @@ from typing import Any, ClassVar
 
 import torch
 
-from safemr import on_policy
-from safemr.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
-from safemr.trust_region import (
+from safemr.learning import on_policy
+from safemr.learning.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
+from safemr.learning.trust_region import (
     TrustRegionConfig,
     conjugate_gradient,
     dot,

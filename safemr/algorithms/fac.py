@@ -7,7 +7,7 @@ SafeMR extend this file by their certificate loss.
 
 | equation of the paper | function |
 |---|---|
-| phi (sis), constraint g (cstr0) | `safemr.energy.energy`, `safemr.energy.constraint` |
+| phi (sis), constraint g (cstr0) | `energy`, `constraint` of `safemr.certificates.energy` |
 | Q_w regression (soft Bellman target) | `reward_target` |
 | Q_phi regression on g | `constraint_values`, the third member of the critic stack |
 | J_pi (losspi) | `policy_loss` |
@@ -15,7 +15,8 @@ SafeMR extend this file by their certificate loss.
 | temperature (Haarnoja et al. 2018) | `temperature_loss` |
 | delays m_pi < m_lambda < m_phi (Alg. 1) | `Agent.update` |
 
-The gradients of these losses are taken by `safemr.autograd` or, equal but faster, `safemr.fused`.
+The gradients of these losses are taken by `safemr.learning.torch_steps` or, equal but faster, by
+`safemr.learning.numba_steps`.
 
 Deviations from the paper and from the authors' released code, each a field of `Config`:
 minimum of two critics (usual practice; Eq. losspi has one), n-step returns, the multiplier is
@@ -34,15 +35,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from safemr import energy, off_policy
-from safemr.buffers import Batch
-from safemr.hyperparameters import Hyperparameters, Setting
-from safemr.networks import ACTIVATIONS, Activation, StackedMLP
-from safemr.policies import network_arrays
-from safemr.training import generator
+from safemr.certificates import energy
+from safemr.learning import off_policy
+from safemr.learning.contract import generator
+from safemr.learning.hyperparameters import Hyperparameters, Setting
+from safemr.learning.networks import ACTIVATIONS, Activation, StackedMLP
+from safemr.learning.policies import network_arrays
+from safemr.learning.replay import Batch
 
 if TYPE_CHECKING:
-    from safemr.autograd import AutogradSteps
+    from safemr.learning.torch_steps import AutogradSteps
 
 VERSION = 1
 
@@ -296,10 +298,10 @@ class Agent:
     def _make_steps(self) -> AutogradSteps:
         # Both differentiate the losses of this module, so they come after it.
         if self.config.backend == "fused" and self.config.device == "cpu":
-            from safemr.fused import FusedSteps
+            from safemr.learning.numba_steps import FusedSteps
 
             return FusedSteps(self)
-        from safemr.autograd import AutogradSteps
+        from safemr.learning.torch_steps import AutogradSteps
 
         return AutogradSteps(self)
 

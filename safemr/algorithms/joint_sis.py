@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from safemr.algorithms import fac
-from safemr.buffers import Batch
+from safemr.learning.replay import Batch
 
 VERSION = 1
 

@@ -10,8 +10,8 @@ rest is feasible actor-critic with this phi; theta takes the place of zeta in th
 
 | equation of the paper | function |
 |---|---|
-| phi (sis), neural | `safemr.energy.corrected`, `neural_energy` |
-| a (sigma + d_min)^n + b k (sisadd) | `safemr.energy.mean_positive_part` |
+| phi (sis), neural | `safemr.certificates.energy.corrected`, `neural_energy` |
+| a (sigma + d_min)^n + b k (sisadd) | `safemr.certificates.energy.mean_positive_part` |
 | certificate loss (SL2add) | `certificate_loss` |
 
 Magnitude. The paper's term is the energy at two points: (sigma + d_min)^n is phi at d = d_dot = 0,
@@ -37,12 +37,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from safemr import energy
 from safemr.algorithms import fac
-from safemr.buffers import Batch
-from safemr.networks import StackedMLP
-from safemr.policies import network_arrays
-from safemr.training import generator
+from safemr.certificates import energy
+from safemr.learning.contract import generator
+from safemr.learning.networks import StackedMLP
+from safemr.learning.policies import network_arrays
+from safemr.learning.replay import Batch
 
 VERSION = 1
 
@@ -178,7 +178,7 @@ class Agent(fac.Agent):
         }
 
     def extras(self) -> dict[str, Any]:
-        """FAC's, with f's network: what `safemr.neural_evidence.neural_certificate` reads."""
+        """FAC's, with f's network: what `safemr.aircraft.neural.neural_certificate` reads."""
         return {
             **super().extras(),
             **network_arrays("certificate", self.certificate),

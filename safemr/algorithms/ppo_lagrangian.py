@@ -27,11 +27,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from safemr import on_policy
-from safemr.lagrange import Multiplier, MultiplierConfig, penalised
-from safemr.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
-from safemr.rollout import minibatches
-from safemr.training import MakeEnvs
+from safemr.learning import on_policy
+from safemr.learning.contract import MakeEnvs
+from safemr.learning.lagrange import Multiplier, MultiplierConfig, penalised
+from safemr.learning.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
+from safemr.learning.rollouts import minibatches
 
 VERSION = 1
 

@@ -31,8 +31,8 @@ import torch
 from torch import Tensor
 
 from safemr.algorithms import fac
-from safemr.buffers import Batch
-from safemr.networks import StackedMLP
+from safemr.learning.networks import StackedMLP
+from safemr.learning.replay import Batch
 
 VERSION = 1
 

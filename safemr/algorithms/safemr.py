@@ -2,7 +2,7 @@
 
 | equation of the paper | function |
 |---|---|
-| a (sigma + d_min)^n + b k (sisadd) | `safemr.energy.magnitude` |
+| a (sigma + d_min)^n + b k (sisadd) | `safemr.certificates.energy.magnitude` |
 | certificate loss (SL2add) | `certificate_loss` |
 
 With a = b = 0 this is JointSIS, number for number. Deviations: those of `joint_sis` and `fac`.
@@ -16,9 +16,9 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from safemr import energy
 from safemr.algorithms import joint_sis
-from safemr.buffers import Batch
+from safemr.certificates import energy
+from safemr.learning.replay import Batch
 
 VERSION = 1
 

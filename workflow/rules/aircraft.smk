@@ -1,6 +1,6 @@
 # The aircraft experiment: its learners are runs of the one training rule. The solved truth is kept
 # in <results root>/.work/aircraft, which no record needs and a clone solves again (15 s).
-from safemr.recorded_energy import NEURAL as NEURAL_NAMES
+from safemr.experiment.recorded_energy import NEURAL as NEURAL_NAMES
 
 # Those with a neural energy function have a table and a figure of their own, and are made when
 # aircraft.algorithms has any.
@@ -8,7 +8,7 @@ NEURAL_PLAN = [run for run in PLAN.aircraft if run.config["algorithm"]["name"] i
 AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
 AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]
 NEURAL = [run for run in NEURAL_PLAN if run in RECORDED]
-ENCOUNTER = dict(PLAN.aircraft[0].config["task"]) if PLAN.aircraft else reference.AIRCRAFT_TASK
+ENCOUNTER = dict(PLAN.aircraft[0].config["task"]) if PLAN.aircraft else paper.AIRCRAFT_TASK
 AIRCRAFT_FIGURES = ["aircraft_slices", "aircraft_airplane", "aircraft_frontier"]
 
 

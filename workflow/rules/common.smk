@@ -21,12 +21,12 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
     [workflow.basedir, *filter(None, [os.environ.get("PYTHONPATH")])]
 )
 
-from safemr.config import load
+from safemr.experiment.config import load
 from safemr.errors import UserError
-from safemr.records import POLICY, PROVENANCE, REQUIRED_FILES
-from safemr.plan_cache import plan_for
-from safemr import reference
-from safemr.sources import digest
+from safemr.experiment.records import POLICY, PROVENANCE, REQUIRED_FILES
+from safemr.experiment.plan_cache import plan_for
+from safemr import paper
+from safemr.experiment.sources import digest
 
 # A file given by --configfile replaces whole top-level keys of the default, so that it can also
 # leave something out; Snakemake's own `configfile:` would merge the two entry by entry.

@@ -1,7 +1,7 @@
 # What the learned numbers are read against: scripted controllers, the check of the certificates,
 # and the verdicts on the paper's claims.
 ROBOT_TASKS = has("point_robot")
-PAPER_TASKS = [task for task in CONFIG.tasks if task in reference.TASKS]
+PAPER_TASKS = [task for task in CONFIG.tasks if task in paper.TASKS]
 BUDGET = {"seeds": list(CONFIG.seeds), "steps": dict(CONFIG.budget)}  # for captions
 
 # Variants whose certificate is learned, and of each the first recorded run on each task.
@@ -16,8 +16,8 @@ for entry in (*PLAN.navigation, *PLAN.sensitivity):
 
 # The paper's certificates are those of one of its tasks, and stand beside what was learned there.
 # Certificates are pictured on one task: theirs, or else the first with a learned one.
-WITH_PAPERS = reference.SENSITIVITY_TASK in PAPER_TASKS
-PICTURED = reference.SENSITIVITY_TASK if WITH_PAPERS else next((task for task, _ in FIRST_RUNS), "")
+WITH_PAPERS = paper.SENSITIVITY_TASK in PAPER_TASKS
+PICTURED = paper.SENSITIVITY_TASK if WITH_PAPERS else next((task for task, _ in FIRST_RUNS), "")
 
 
 rule controllers:
@@ -83,7 +83,7 @@ rule claims:
         progress=rules.aggregate.output.progress,
         certificates=rules.certificates.output.table[0] if WITH_PAPERS or FIRST_RUNS else [],
         aircraft=f"{SUMMARY}/aircraft.csv"
-        if CONFIG.aircraft and CONFIG.aircraft.task == reference.AIRCRAFT_TASK
+        if CONFIG.aircraft and CONFIG.aircraft.task == paper.AIRCRAFT_TASK
         else [],
     output:
         table=expand(f"{RESULTS}/tables/claims.{{end}}", end=["csv", "tex"]),
@@ -99,7 +99,7 @@ rule claims:
         points={
             label: list(point)
             for label, point in PLAN.points.items()
-            if CONFIG.sensitivity.task == reference.SENSITIVITY_TASK
+            if CONFIG.sensitivity.task == paper.SENSITIVITY_TASK
         },
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,

@@ -9,7 +9,7 @@ import base64
 import fcntl
 from pathlib import Path
 
-from safemr.locks import ProcessLock
+from safemr.experiment.locks import ProcessLock
 
 # What this workflow makes; what others left in the same .snakemake is theirs.
 MADE = [Path(RESULTS, name) for name in ("runs", "summary", "tables", "logs")] + [Path(FIGURES)]

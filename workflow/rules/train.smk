@@ -27,7 +27,7 @@ rule train:
     message:
         "Training {wildcards.variant} on {wildcards.task}, seed {wildcards.seed}"
     shell:
-        "exec {sys.executable:q} -u -P -m safemr.train --resolved {params.resolved:q}"
+        "exec {sys.executable:q} -u -P -m safemr.experiment.train --resolved {params.resolved:q}"
         " --variant {params.variant:q} --root {params.root:q} --die-with-parent --wait"
         # The mirror is no part of a run: what is not in `params` does not make it train again.
         " --wandb {CONFIG.wandb_mode:q} --wandb-project {CONFIG.wandb_project:q}"
@@ -36,7 +36,7 @@ rule train:
 
 if workflow.is_main_process and workflow.output_settings.dryrun and not CONFIG.allow_missing:
     from safemr.errors import tell
-    from safemr.forecast import announced
+    from safemr.experiment.forecast import announced
 
     for line in announced(CONFIG.results_root, PLAN.trained):
         tell(line)

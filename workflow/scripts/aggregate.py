@@ -4,8 +4,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import records, statistics
 from safemr.cli import reported_errors
+from safemr.experiment import records
+from safemr.report import statistics
 
 with reported_errors():
     runs, progress = records.read_records(Path(snakemake.params.root), snakemake.params.folders)

@@ -5,21 +5,22 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import aircraft_evidence, reachability, reference
+from safemr import paper
+from safemr.aircraft import reachability, scoring
 from safemr.cli import reported_errors
 from safemr.conventions import COVERS
-from safemr.measurements import Measurements
-from safemr.plotting import aircraft, style
+from safemr.measure.store import Measurements
+from safemr.report.figures import aircraft, style
 
 params = snakemake.params
 comparison = pd.read_csv(snakemake.input.comparison)
 frontier = pd.read_csv(snakemake.input.frontier)
 with reported_errors():
-    sets = aircraft_evidence.TrueSets.cached(params.cache, task=params.task)
-    x, y, cuts = aircraft_evidence.slices(sets, comparison, Measurements(params.root))
+    sets = scoring.TrueSets.cached(params.cache, task=params.task)
+    x, y, cuts = scoring.slices(sets, comparison, Measurements(params.root))
 d_min = reachability.CONSTANT.d_min
 head_on = cuts[3]
-learned = {name: head_on.learned[name] for name in reference.LEARNERS if name in head_on.learned}
+learned = {name: head_on.learned[name] for name in paper.LEARNERS if name in head_on.learned}
 figures = (
     aircraft.slices(x, y, cuts, d_min),
     aircraft.single(x, y, replace(head_on, learned=learned), d_min),

@@ -1,8 +1,8 @@
 """What the best energy functions of the paper's family can do against the true unsafe set."""
 
-from safemr.aircraft_evidence import TrueSets, measured_frontier
+from safemr.aircraft.scoring import TrueSets, measured_frontier
 from safemr.cli import reported_errors
-from safemr.measurements import Measurements
+from safemr.measure.store import Measurements
 
 params = snakemake.params
 with reported_errors():

@@ -5,12 +5,15 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from safemr import neural_evidence, reachability, records, reference, statistics
-from safemr.aircraft_evidence import TrueSets
+from safemr import paper
+from safemr.aircraft import neural, reachability
+from safemr.aircraft.scoring import TrueSets
 from safemr.cli import reported_errors
 from safemr.conventions import COVERS
-from safemr.measurements import Measurements
-from safemr.plotting import aircraft, style
+from safemr.experiment import records
+from safemr.measure.store import Measurements
+from safemr.report import statistics
+from safemr.report.figures import aircraft, style
 
 torch.set_num_threads(1)
 given, params, output = snakemake.input, snakemake.params, snakemake.output
@@ -20,9 +23,9 @@ root = Path(params.root)
 with reported_errors():
     runs, _ = records.read_records(root, params.folders)
     runs = runs.reindex(columns=runs.columns.union(expected.columns))
-    comparison, x, y, cut = neural_evidence.measured(
+    comparison, x, y, cut = neural.measured(
         Measurements(root),
-        TrueSets.cached(params.cache, neural_evidence.LOG2_STATES, params.task),
+        TrueSets.cached(params.cache, neural.LOG2_STATES, params.task),
         frontier,
         root,
         runs,
@@ -30,9 +33,9 @@ with reported_errors():
     )
 comparison.to_csv(output.comparison, index=False)
 missing = statistics.missing_runs(expected, runs)
-neural_evidence.comparison_table(comparison, missing).write(Path(output.markdown).parent)
+neural.comparison_table(comparison, missing).write(Path(output.markdown).parent)
 # One seed of each in the slice, every seed on the trade-off, beside the learners of zeta.
-learned = others["variant"].isin(reference.LEARNERS)
+learned = others["variant"].isin(paper.LEARNERS)
 beside = others[learned | (others["kind"] == "certificate")]
 points = pd.concat([beside, comparison[comparison["kind"] != "certificate"]])
 d_min = reachability.CONSTANT.d_min

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import runs
 from safemr.algorithms import joint_sis
-from safemr.plotting import curves, style
+from safemr.experiment import planning
+from safemr.report.figures import curves, style
 
 params = snakemake.params
 progress = pd.read_csv(snakemake.input.progress)
 progress = progress[progress["task"] == params.task]
 rows = []
 for variant, described in params.algorithms.items():
-    algorithm = runs.load_algorithm(described["name"])
+    algorithm = planning.load_algorithm(described["name"])
     config = algorithm.hyperparameters(**described["hyperparameters"])
     log = progress[(progress["variant"] == variant) & (progress["metric"] == "updates")]
     total = (described["steps"] - config.start_steps) // config.update_every

@@ -4,10 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from safemr import certify, reference
+from safemr import paper
 from safemr.cli import reported_errors
-from safemr.measurements import Measurements
-from safemr.plotting import style
+from safemr.measure import certify
+from safemr.measure.store import Measurements
+from safemr.report.figures import style
 from safemr.tasks import name_of
 
 params, output = snakemake.params, snakemake.output
@@ -28,7 +29,7 @@ with reported_errors():
     chosen = [(certificate, certify.DEFAULT_TASK) for certificate in papers]
     chosen += [learned[folder] for folder in params.pictured] or jobs[-1:]
     # The map is that of the last one.
-    chosen.sort(key=lambda job: job[0].name.partition(" (")[0] == reference.METHOD)
+    chosen.sort(key=lambda job: job[0].name.partition(" (")[0] == paper.METHOD)
     mapped = certify.measured_margins(measurements, *chosen[-1])
     figure = certify.picture([certificate for certificate, _ in chosen], *mapped)
 table = certify.certificate_table(rows)

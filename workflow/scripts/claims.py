@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import claims, tables
-from safemr.evidence import Evidence
+from safemr.report import claims, tables
+from safemr.report.findings import Evidence
 
 given, params = snakemake.input, snakemake.params
 evidence = Evidence(

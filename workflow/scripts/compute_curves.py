@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import statistics
-from safemr.plotting import curves, style
+from safemr.report import statistics
+from safemr.report.figures import curves, style
 
 params = snakemake.params
 progress, runs = pd.read_csv(snakemake.input.progress), pd.read_csv(snakemake.input.runs)

@@ -1,8 +1,8 @@
 """Scores of the scripted controllers, in the same form as those of the learned policies."""
 
-from safemr import controllers
 from safemr.cli import reported_errors
-from safemr.measurements import Measurements
+from safemr.measure import controllers
+from safemr.measure.store import Measurements
 
 params = snakemake.params
 with reported_errors():

@@ -5,16 +5,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from safemr import reference, statistics
-from safemr.plotting import scores as drawing
-from safemr.plotting import style
-from safemr.tables import SafetyRule
+from safemr import paper
+from safemr.report import statistics
+from safemr.report.figures import scores as drawing
+from safemr.report.figures import style
+from safemr.report.tables import SafetyRule
 
 params = snakemake.params
 final = pd.read_csv(snakemake.input.scores)
 final = final[final["task"].isin(params.tasks) & final["variant"].isin(params.variants)]
 rule = SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
-scale = {task: reference.TABLE_I[task].safemr for task in params.tasks if task in reference.TABLE_I}
+scale = {task: paper.TABLE_I[task].safemr for task in params.tasks if task in paper.TABLE_I}
 pairs = final[["task", "variant"]].drop_duplicates().itertuples(index=False, name=None)
 figures = {
     "return_against_cost": drawing.return_against_cost(
@@ -34,9 +35,7 @@ if scale:  # the paper's return is the unit
         (final, "aggregate_scores", "return"),
         (rule.safe_returns(final), "aggregate_safe_scores", "safe return"),
     ):
-        aggregates = statistics.aggregate(
-            chosen, params.variants, reference.METHOD, scale, thresholds
-        )
+        aggregates = statistics.aggregate(chosen, params.variants, paper.METHOD, scale, thresholds)
         figures[file] = drawing.aggregate_scores(
             aggregates,
             name=name,

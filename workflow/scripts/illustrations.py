@@ -3,14 +3,15 @@
 from pathlib import Path
 
 from envs.drawing import draw_scene
-from safemr import certify, reference
-from safemr.falsification import make_simulator
-from safemr.plotting import certificate, scenes, style
+from safemr import paper
+from safemr.certificates.falsification import make_simulator
+from safemr.measure import certify
+from safemr.report.figures import certificate, scenes, style
 from safemr.tasks import name_of
 
-learned = reference.TABLE_II[reference.HEADLINE]
+learned = paper.TABLE_II[paper.HEADLINE]
 d_min = float(make_simulator(certify.DEFAULT_TASK, 1).d_min)
-pair = ((r"handcrafted $\phi_h$", reference.PHI_H), ("learned by SafeMR (paper)", learned))
+pair = ((r"handcrafted $\phi_h$", paper.PHI_H), ("learned by SafeMR (paper)", learned))
 layouts = {name_of(task): make_simulator(task, 1).scene(0) for task in snakemake.params.tasks}
 drawn = {
     "energy_and_safe_set": lambda: certificate.energy_and_safe_set(learned, d_min),

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.plotting import curves, style
+from safemr.report.figures import curves, style
 
 params = snakemake.params
 progress = pd.read_csv(snakemake.input.progress)

@@ -5,22 +5,27 @@ from pathlib import Path
 import pandas as pd
 
 from envs.drawing import draw_scene
-from safemr import reference
-from safemr.plotting import certificate, data, scenes, style
+from safemr import files, paper
+from safemr.measure import tracks
+from safemr.report.figures import certificate, scenes, style
 
 params, output = snakemake.params, snakemake.output
-stored = {task: data.load(path) for task, path in zip(params.tasks, snakemake.input, strict=True)}
+stored = {
+    task: files.load_arrays(path) for task, path in zip(params.tasks, snakemake.input, strict=True)
+}
 
 
 def recorded(task, part):
     """Variant -> arrays of one part, for the variants whose policy was recorded."""
-    found = {variant: data.below(stored[task], f"{variant}/{part}/") for variant in params.variants}
+    found = {
+        variant: tracks.below(stored[task], f"{variant}/{part}/") for variant in params.variants
+    }
     return {variant: arrays for variant, arrays in found.items() if arrays}
 
 
 episodes = {task: recorded(task, "episodes") for task in params.tasks}
 maps = {task: recorded(task, "map") for task in params.tasks}
-method = reference.METHOD if reference.METHOD in params.variants else params.variants[0]
+method = paper.METHOD if paper.METHOD in params.variants else params.variants[0]
 figures = [
     certificate.multiplier_maps(
         {task: found[method] for task, found in maps.items() if method in found}, params.tasks

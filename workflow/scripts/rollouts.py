@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from safemr import rollouts
-from safemr.certify import certificate_of_record
+from safemr import files
 from safemr.cli import reported_errors
-from safemr.measurements import Measurements
-from safemr.plotting import data
+from safemr.measure import trajectories
+from safemr.measure.certify import certificate_of_record
+from safemr.measure.store import Measurements
 
 params = snakemake.params
 measurements = Measurements(params.root)
@@ -17,8 +17,8 @@ with reported_errors():
         if certificate.policy is None:
             print(f"no policy in {folder}")
             continue
-        made = rollouts.measured(
+        made = trajectories.measured(
             measurements, certificate, entry, layouts=params.layouts, steps=params.steps
         )
         arrays |= {f"{variant}/{name}": values for name, values in made.items()}
-data.save(snakemake.output[0], arrays)
+files.save_arrays(snakemake.output[0], arrays)

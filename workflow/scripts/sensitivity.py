@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import sensitivity, statistics
-from safemr.plotting import curves, style
+from safemr.report import sensitivity, statistics
+from safemr.report.figures import curves, style
 
 params = snakemake.params
 points = {variant: (a, b) for variant, (a, b) in params.points.items()}

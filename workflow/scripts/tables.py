@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import comparisons, compute, statistics, tables
+from safemr.report import compute, differences, statistics, tables
 
 given, params = snakemake.input, snakemake.params
 learned = pd.read_csv(given.scores)
@@ -19,7 +19,7 @@ made = [
         learned, missing=missing, rule=rule, tasks=params.tasks, baselines=params.baselines
     ),
     tables.full_results(scores, missing=missing, rule=rule, layouts=params.layouts),
-    comparisons.differences(learned, missing=missing),
+    differences.differences(learned, missing=missing),
     compute.table(runs),
 ]
 if params.push:

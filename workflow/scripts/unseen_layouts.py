@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from safemr import unseen
 from safemr.cli import reported_errors
-from safemr.measurements import Measurements
+from safemr.measure import unseen_layouts
+from safemr.measure.store import Measurements
 
 params = snakemake.params
 with reported_errors():
-    scores = unseen.measured_scores(
+    scores = unseen_layouts.measured_scores(
         Measurements(params.root),
         [Path(params.root, folder) for folder in params.folders],
         episodes=params.episodes,

@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import comparisons, tables, unseen
+from safemr.measure import unseen_layouts
+from safemr.report import differences, tables
 
 params = snakemake.params
 flown = pd.concat([pd.read_csv(path) for path in snakemake.input.flown], ignore_index=True)
-table = unseen.table(
+table = unseen_layouts.table(
     flown,
     pd.read_csv(snakemake.input.scores),
     episodes=params.episodes,
@@ -16,5 +17,5 @@ table = unseen.table(
     rule=tables.SafetyRule(params.tolerance, params.clean_share),
 )
 source = f"{params.episodes} unseen layouts"
-for made in (table, comparisons.differences(flown, name="unseen_differences", source=source)):
+for made in (table, differences.differences(flown, name="unseen_differences", source=source)):
     made.write(Path(snakemake.output.table[0]).parent)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import sensitivity, statistics, tables
-from safemr.plotting import scores as drawings
-from safemr.plotting import style
+from safemr.report import sensitivity, statistics, tables
+from safemr.report.figures import scores as drawings
+from safemr.report.figures import style
 
 params = snakemake.params
 points = {variant: (a, b) for variant, (a, b) in params.points.items()}

@@ -1,0 +1,1 @@
+"""The aircraft experiment: the true unsafe set, and what learners claim of it."""

@@ -1,0 +1,296 @@
+"""Neural energy functions of the aircraft experiment: what recorded ones claim, what one could.
+
+The records are runs of `safemr.algorithms.neural_safemr`. The *control* is the same function fitted
+to the solved value by supervised learning: what it misses is the architecture's, what a learner
+misses beyond it is the loss's, the data's or the policy's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from envs.aircraft import AircraftDynamics, AircraftVectorEnv, observe
+from safemr import paper
+from safemr.aircraft import reachability, scoring, unsafe_sets
+from safemr.aircraft.reachability import Solution
+from safemr.aircraft.reachability.grid import Floats
+from safemr.aircraft.scoring import TrueSets
+from safemr.aircraft.unsafe_sets import Certificate, Truth
+from safemr.algorithms.neural_safemr import neural_energy
+from safemr.conventions import COVERS
+from safemr.experiment.planning import installed
+from safemr.experiment.recorded_energy import NETWORK, learners
+from safemr.learning.networks import StackedMLP
+from safemr.learning.observation import ObservationTransform
+from safemr.learning.policies import Policy, network_from_arrays
+from safemr.measure.store import VERSIONS, Measurements, record_inputs
+from safemr.measure.tracks import below
+from safemr.report.figures.aircraft import Slice
+from safemr.report.tables import Table, describe_missing
+
+CONTROL = "fit to the truth"
+CONTROL_SHARES = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
+ARRAYS = ("zeta", "length_scale", "smoothing", NETWORK)  # in a policy file
+SLICE, SPACING = 180.0, 0.1  # [degree], [m] of the plane that is drawn
+LOG2_STATES = 17  # Sobol points of the comparison: volumes are right to 0.1 %
+_CHUNK = 2**16  # states evaluated at once, which bounds the memory
+
+
+def neural_certificate(
+    dynamics: AircraftDynamics,
+    transform: ObservationTransform,
+    network: StackedMLP,
+    *,
+    zeta: Tensor,
+    length_scale: float,
+    smoothing: float,
+) -> Certificate:
+    """phi of states [..., 3] by the network f and the handcrafted zeta beside it."""
+
+    @torch.no_grad()
+    def of(states: Floats) -> NDArray[np.float32]:
+        d, d_dot = (
+            torch.from_numpy(values[:, None]).float()
+            for values in (dynamics.separation(states), dynamics.separation_rate(states))
+        )
+        return neural_energy(
+            network,
+            torch.from_numpy(transform(observe(states))),
+            d,
+            d_dot,
+            dynamics.d_min,
+            zeta=zeta,
+            length_scale=length_scale,
+            smoothing=smoothing,
+        ).numpy()
+
+    def phi(states: Floats) -> Floats:
+        flat = states.reshape(-1, 3)
+        parts = [of(flat[at : at + _CHUNK]) for at in range(0, len(flat), _CHUNK)]
+        return np.concatenate(parts).astype(float).reshape(states.shape[:-1])
+
+    return phi
+
+
+def recorded_certificate(dynamics: AircraftDynamics, policy: Policy) -> Certificate:
+    """The neural energy that a recorded policy was trained with; KeyError where there is none."""
+    saved = policy.extras
+    return neural_certificate(
+        dynamics,
+        policy.transform,
+        network_from_arrays("certificate", saved),
+        zeta=torch.from_numpy(saved["zeta"]),
+        length_scale=float(saved["length_scale"]),
+        smoothing=float(saved["smoothing"]),
+    )
+
+
+def recorded_certificates(
+    dynamics: AircraftDynamics, root: Path, runs: pd.DataFrame
+) -> dict[str, list[Certificate]]:
+    """Variant -> its certificates by seed, of the rows of `records.read_records`'s index."""
+    found: dict[str, list[Certificate]] = {}
+    for run, saved in learners(root, runs.sort_values("seed"), dynamics, ARRAYS):
+        certificate = recorded_certificate(dynamics, saved.policy())
+        found.setdefault(str(run.variant), []).append(certificate)
+    return found
+
+
+def settings_of(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of `fit_to_truth` that make its energy that of a run."""
+    return {
+        "zeta": [hyperparameters[name] for name in ("sigma", "k", "n")],
+        "length_scale": hyperparameters["length_scale"],
+        "smoothing": hyperparameters["smoothing"],
+        "hidden": hyperparameters["certificate_hidden"],
+    }
+
+
+def fit_to_truth(
+    truth: Truth,
+    *,
+    zeta: Sequence[float] = (0.06, 1.0, 1.0),
+    length_scale: float = 5.0,
+    smoothing: float = 0.1,
+    hidden: int = 32,
+    steps: int = 4000,
+    batch: int = 1024,
+    lr: float = 5e-3,
+    seed: int = 100,
+) -> Certificate:
+    """The control: f by logistic regression of {V <= 0} on phi / tau, outside the disc.
+
+    Adam, learning rate falling linearly to 0. The defaults are those of the learners' energy.
+    """
+    dynamics = truth.dynamics
+    outside = ~truth.disc
+    states, unsafe = truth.states[outside], torch.from_numpy(truth.unsafe[outside]).float()
+    transform = ObservationTransform.for_layout(AircraftVectorEnv.observation_layout)
+    fixed: dict[str, Any] = {
+        **{"zeta": torch.tensor(zeta), "length_scale": length_scale, "smoothing": smoothing}
+    }
+    generator = torch.Generator().manual_seed(seed)
+    network = StackedMLP(
+        1, (transform.dim, hidden, hidden, 1), "tanh", generator=generator, output_gain=0.0
+    )
+    inputs = torch.from_numpy(transform(observe(states)))
+    d, d_dot = (
+        torch.from_numpy(values[:, None]).float()
+        for values in (dynamics.separation(states), dynamics.separation_rate(states))
+    )
+    adam = torch.optim.Adam([network.parameters], lr=lr, fused=True)
+    for step in range(steps):
+        adam.param_groups[0]["lr"] = lr * (1.0 - step / steps)
+        rows = torch.randint(len(states), (batch,), generator=generator)
+        phi = neural_energy(network, inputs[rows], d[rows], d_dot[rows], dynamics.d_min, **fixed)
+        loss = torch.nn.functional.binary_cross_entropy_with_logits(phi / smoothing, unsafe[rows])
+        (network.parameters.grad,) = torch.autograd.grad(loss, [network.parameters])
+        adam.step()
+    return neural_certificate(dynamics, transform, network, **fixed)
+
+
+def shifted_to_miss(truth: Truth, phi: Certificate, missed_share: float) -> Certificate:
+    """phi plus the least constant with which it misses at most ``missed_share`` of the shell."""
+    shell = np.sort(phi(truth.states[truth.unsafe & ~truth.disc]))
+    threshold = shell[int(missed_share * len(shell))]
+    shift = np.nextafter(-threshold, np.inf)
+    return lambda states: phi(states) + shift
+
+
+def compare(
+    truth: Truth,
+    solution: Solution,
+    frontier: pd.DataFrame,
+    root: Path,
+    runs: pd.DataFrame,
+    control: Certificate,
+    flights: int = scoring.FLIGHTS,
+) -> pd.DataFrame:
+    """Rows as those of `aircraft_evidence.compare`: runs, then the control; of kind "control" are
+    the control's volumes when it is shifted to miss each of `CONTROL_SHARES`.
+
+    ``obeyed_collision_share`` is that of the policy which obeys the certificate (`Obedient`), from
+    a fifth of the starts.
+    """
+    dynamics = truth.dynamics
+    starts = unsafe_sets.safe_starts(solution, flights, scoring.STARTS_SEED)
+
+    def measured(phi: Certificate, eta: float) -> dict[str, float]:
+        obedient = scoring.Obedient(dynamics, phi)
+        obeyed = scoring.flights_of(obedient, starts[: flights // 5], truth)
+        return {
+            **asdict(unsafe_sets.compare_certificate(truth, phi, eta)),
+            "eta": eta,
+            "obeyed_collision_share": obeyed["collision_share"],
+        }
+
+    rows: list[dict[str, Any]] = [
+        {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
+        | measured(recorded_certificate(dynamics, policy), saved.eta)
+        | scoring.flights_of(policy, starts, truth)
+        for run, saved, policy in (
+            (run, saved, saved.policy()) for run, saved in learners(root, runs, dynamics, ARRAYS)
+        )
+    ]
+    covering = shifted_to_miss(truth, control, COVERS)
+    rows += [
+        {"kind": "certificate", "variant": name, "seed": -1} | measured(phi, 0.0)
+        for name, phi in ((CONTROL, control), (f"{CONTROL}, shifted", covering))
+    ]
+    now, shell = control(truth.states), truth.unsafe & ~truth.disc
+    for share in CONTROL_SHARES:
+        threshold = np.sort(now[shell])[int(share * np.count_nonzero(shell))]
+        claimed = (now >= threshold) | truth.disc
+        rows.append(
+            {"kind": "control", "variant": CONTROL, "seed": -1}
+            | {"missed_share": float(np.mean(~claimed[shell]))}
+            | {"volume_ratio": float(claimed.sum() / truth.unsafe.sum())}
+        )
+    table = pd.DataFrame(rows)
+    table["covers"] = table["missed_share"] <= COVERS
+    table["least_volume_ratio"] = np.interp(
+        table["missed_share"], frontier["missed_share"], frontier["volume_ratio"]
+    )
+    return table.reindex(columns=table.columns.union(["collision_share", "effort"], sort=False))
+
+
+def measured(
+    measurements: Measurements,
+    sets: TrueSets,
+    frontier: pd.DataFrame,
+    root: Path,
+    runs: pd.DataFrame,
+    energy: Mapping[str, Any],
+) -> tuple[pd.DataFrame, Floats, Floats, Slice]:
+    """`compare`, with a control of the hyperparameters ``energy``, and `slice_at` for one seed of
+    each variant; both kept among ``measurements``."""
+    inputs: dict[str, Any] = {
+        "task": installed(sets.task),
+        "policies": [record_inputs(root / str(folder)) for folder in sorted(runs["folder"])],
+        "energy": settings_of(energy), "log2_states": sets.log2_states,
+        "flights": scoring.FLIGHTS, "solver": reachability.VERSION,
+        "frontier": VERSIONS["aircraft_frontier"],
+    }  # fmt: skip
+
+    def rows() -> Any:
+        control = fit_to_truth(sets.truth, **inputs["energy"])
+        table = compare(sets.truth, sets.constant, frontier, root, runs, control)
+        return table.to_dict("records")
+
+    def arrays() -> dict[str, NDArray[Any]]:
+        certificates = recorded_certificates(sets.truth.dynamics, root, runs)
+        shown = {variant: found[:1] for variant, found in certificates.items()}
+        _, _, cut = slice_at(sets.constant, shown)
+        learned = {f"learned/{name}": found[0] for name, found in cut.learned.items()}
+        return {"truth": cut.truth, "handcrafted": cut.handcrafted, **learned}
+
+    comparison = pd.DataFrame(measurements.rows("aircraft_neural", "neural", inputs, rows))
+    kept = measurements.arrays("aircraft_neural_slice", "neural", inputs, arrays)
+    learned = {name: [values] for name, values in below(kept, "learned/").items()}
+    cut = Slice(float(np.radians(SLICE)), kept["truth"], kept["handcrafted"], learned)
+    return comparison, *scoring.plane(SPACING), cut
+
+
+def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame) -> Table:
+    """Learners (mean and 95% t interval over seeds), then the control."""
+    shown = comparison[comparison["kind"] != "control"]
+    caption = (
+        "Aircraft, neural energy functions: columns as in the aircraft table; least ratio is what "
+        "the best [sigma, k, n] needs at the same share missed; obeyed: collisions of the policy "
+        "that keeps the constraint with the least turn, or violates it least. "
+        f"{CONTROL.capitalize()}: the same function by supervised learning on the solved value, "
+        f"as it is and shifted to miss {100 * COVERS:g}%."
+    )
+    lines = scoring.table_lines(shown).drop(columns="at own eta")
+    obeyed = shown.assign(collision_share=shown["obeyed_collision_share"])
+    lines["obeyed %"] = scoring.table_lines(obeyed)["collisions %"]
+    notes = [f"Runs missing: {describe_missing(missing)}."] if len(missing) else []
+    return Table("aircraft_neural", caption, comparison, lines, tuple(notes))
+
+
+def slice_at(
+    solution: Solution,
+    learned: Mapping[str, Sequence[Certificate]],
+    degrees: float = SLICE,
+    spacing: float = SPACING,
+) -> tuple[Floats, Floats, Slice]:
+    """x [X], y [Y] and the unsafe sets of certificates (the disc included) at one psi."""
+    x, y = scoring.plane(spacing)
+    psi = float(np.radians(degrees))
+    states = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
+    inside = solution.dynamics.d_min - solution.dynamics.separation(states)
+    handcrafted = unsafe_sets.energy_certificate(solution.dynamics, paper.PHI_H)(states)
+    sets = {
+        variant: [np.maximum(phi(states), inside) for phi in found]
+        for variant, found in learned.items()
+    }
+    return x, y, Slice(psi, solution(states), np.maximum(handcrafted, inside), sets)

@@ -1,0 +1,409 @@
+"""The aircraft experiment's numbers: every learner, and what to hold it against, as tables.
+
+A *comparison* is a DataFrame with one row per certificate (and policy, where there is one): the
+recorded runs, then fixed references. Columns: ``kind`` ("learner", "certificate", "policy"),
+``variant``, ``seed`` (-1 for references), ``sigma, k, n`` in units of ``length_scale`` metres,
+``eta`` in units of phi, `COLUMNS` of `unsafe_sets.CertificateMetrics`, ``least_volume_ratio`` (the
+frontier's at the same missed share), and those of `unsafe_sets.Flights.summary`. What does not
+apply to a row is nan.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
+from safemr import paper
+from safemr.aircraft import reachability, unsafe_sets
+from safemr.aircraft.reachability import Solution
+from safemr.aircraft.reachability.grid import Floats
+from safemr.aircraft.unsafe_sets import Truth
+from safemr.certificates.energy import constraint
+from safemr.conventions import COVERS
+from safemr.experiment.planning import installed
+from safemr.experiment.recorded_energy import Saved, learners
+from safemr.learning.evaluation import Acts
+from safemr.measure.store import Measurements, record_inputs, record_label
+from safemr.report import statistics
+from safemr.report.figures.aircraft import Slice
+from safemr.report.tables import ABSENT, FEW, Table, describe_missing, plus_minus
+from safemr.tasks import Task, name_of
+
+FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
+MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+# Fixed certificates, in metres. The last is where the released JointSIS code starts.
+CERTIFICATES: Mapping[str, tuple[float, float, float]] = {
+    "phi_h": paper.PHI_H,
+    "phi_0": paper.PHI_0,
+    "code init": (0.3, 1.0, 1.0),
+}
+TRUE_SET, ADVERSARIAL_SET, STRAIGHT = "true set", "true set, adversarial", "straight flight"
+COLUMNS = ("volume_ratio", "missed_share", "iou", "infeasible_share", "infeasible_share_eta",
+           "leak_share")  # fmt: skip
+
+
+class _Straight:
+    """No turn at all: how often the encounter resolves itself."""
+
+    def act(self, observations: NDArray[Any], deterministic: bool = True) -> NDArray[np.float32]:
+        return np.zeros((len(observations), 1), np.float32)
+
+
+class Obedient:
+    """The least turn that keeps g <= 0 (Eq. cstr0, eta 0), else the one with the least g.
+
+    What a perfect learner of this certificate would do: collisions it has are the certificate's.
+    """
+
+    def __init__(self, dynamics: AircraftDynamics, phi: unsafe_sets.Certificate) -> None:
+        self.dynamics, self.phi = dynamics, phi
+        rates = np.linspace(-dynamics.turn_limit, dynamics.turn_limit, 21)
+        self.rates = rates[np.argsort(np.abs(rates), kind="stable")]
+
+    def act(self, observations: Floats, deterministic: bool = True) -> NDArray[np.float32]:
+        x, y, cos, sin = observations.T
+        states = np.stack([x, y, np.arctan2(sin, cos)], axis=-1)
+        (b,) = self.dynamics.other_turns
+        now = self.phi(states)
+        g = np.stack(
+            [constraint(now, self.phi(self.dynamics.flow(states, a, b)), 0.0) for a in self.rates]
+        )
+        chosen = np.argmax(g <= np.maximum(g.min(axis=0), 0.0), axis=0)
+        return self.rates[chosen, None].astype(np.float32)
+
+
+class TrueSets:
+    """The solved values of both cases and samples of the first, each made when first asked for.
+
+    ``solve`` returns the solution of a case; nobody waits for it where all numbers are kept. The
+    constant case is the traffic of ``task`` (`safemr.aircraft.unsafe_sets.dynamics_of`).
+    """
+
+    def __init__(
+        self,
+        solve: Callable[[AircraftDynamics], Solution],
+        log2_states: int = 19,
+        task: Task = paper.AIRCRAFT_TASK,
+    ) -> None:
+        self._solve, self.log2_states, self.task = solve, log2_states, task
+        self.dynamics = unsafe_sets.dynamics_of(task)
+
+    @classmethod
+    def cached(
+        cls, folder: Path | str, log2_states: int = 19, task: Task = paper.AIRCRAFT_TASK
+    ) -> TrueSets:
+        """From the solutions kept in ``folder`` (`safemr.aircraft.reachability.load_or_solve`)."""
+        return cls(functools.partial(reachability.load_or_solve, Path(folder)), log2_states, task)
+
+    def kept_as(self, label: str) -> tuple[str, dict[str, Any]]:
+        """Label and inputs of what is measured of the solution alone; those of the registered task
+        name none, as ever."""
+        if self.dynamics == reachability.CONSTANT:
+            return label, {}
+        return f"{label} {name_of(self.task)}", {"task": installed(self.task)}
+
+    @functools.cached_property
+    def constant(self) -> Solution:
+        return self._solve(self.dynamics)
+
+    @functools.cached_property
+    def adversarial(self) -> Solution:
+        return self._solve(reachability.ADVERSARIAL)
+
+    @functools.cached_property
+    def truth(self) -> Truth:
+        return Truth.sample(self.constant, self.log2_states)
+
+    def starts(self, flights: int) -> Floats:
+        """[N, 3] safe initial states, the same for every policy."""
+        return unsafe_sets.safe_starts(self.constant, flights, STARTS_SEED)
+
+
+def measured_frontier(
+    measurements: Measurements, sets: TrueSets, missed_shares: Sequence[float] = MISSED_SHARES
+) -> pd.DataFrame:
+    """`frontier_table`, kept among ``measurements``."""
+    label, own = sets.kept_as("frontier")
+    inputs = {
+        "missed_shares": list(missed_shares), "solver": reachability.VERSION,
+        "log2_states": sets.log2_states, **own,
+    }  # fmt: skip
+    rows = measurements.rows(
+        "aircraft_frontier", label, inputs,
+        lambda: frontier_table(sets.truth, missed_shares).to_dict("records"),
+    )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def frontier_table(truth: Truth, missed_shares: Sequence[float] = MISSED_SHARES) -> pd.DataFrame:
+    """missed_share, volume_ratio, sigma, k, n (metres): the best members of the energy family."""
+    points = unsafe_sets.frontier(truth, missed_shares)
+    rows = [(point.missed_share, point.volume_ratio, *point.zeta) for point in points]
+    return pd.DataFrame(rows, columns=["missed_share", "volume_ratio", "sigma", "k", "n"])
+
+
+def compare(
+    sets: TrueSets,
+    frontier: pd.DataFrame,
+    root: Path,
+    runs: pd.DataFrame,
+    flights: int = FLIGHTS,
+) -> pd.DataFrame:
+    """The comparison of recorded runs (rows of `records.read_records`'s index) and references.
+
+    What is measured is kept among the measurements under ``root``. Raises UserError naming every
+    record whose policy file does not say what its certificate is, and one of other traffic.
+    """
+    measurements = Measurements(root)
+    shared = {
+        "task": installed(sets.task), "flights": flights, "starts_seed": STARTS_SEED,
+        "log2_states": sets.log2_states, "solver": reachability.VERSION,
+    }  # fmt: skip
+    rows = []
+    for run, saved in learners(root, runs, sets.dynamics):
+
+        def measure(saved: Saved = saved) -> dict[str, float]:
+            own = _certificate(sets.truth, saved.zeta, saved.length_scale, saved.eta)
+            return own | flights_of(saved.policy(), sets.starts(flights), sets.truth)
+
+        label = record_label(saved.folder)
+        inputs = {**shared, "policy": record_inputs(root / str(run.folder))}
+        rows.append(
+            {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
+            | measurements.rows("aircraft_learners", label, inputs, measure)
+        )
+    inputs = {**shared, "certificates": {name: list(zeta) for name, zeta in CERTIFICATES.items()}}
+    rows += measurements.rows(
+        "aircraft_references", sets.kept_as("references")[0], inputs,
+        lambda: _references(sets, flights),
+    )  # fmt: skip
+    table = pd.DataFrame(rows)
+    table["covers"] = table["missed_share"] <= COVERS
+    table["least_volume_ratio"] = np.interp(
+        table["missed_share"], frontier["missed_share"], frontier["volume_ratio"]
+    )
+    return table
+
+
+def _references(sets: TrueSets, flights: int) -> list[dict[str, Any]]:
+    """The rows of what is held against the learners."""
+    truth, starts = sets.truth, sets.starts(flights)
+    rows: list[dict[str, Any]] = [
+        {"kind": "certificate", "variant": name, "seed": -1}
+        | _certificate(truth, zeta, length_scale=1.0, eta=0.0)
+        | flights_of(_obeying(truth, zeta), starts, truth)
+        for name, zeta in CERTIFICATES.items()
+    ]
+    wider = sets.adversarial(truth.states) <= 0
+    rows += [
+        {"kind": "certificate", "variant": ADVERSARIAL_SET, "seed": -1}
+        | {"volume_ratio": float(wider.sum() / truth.unsafe.sum()), "missed_share": 0.0}
+        | {"iou": float((wider & truth.unsafe).sum() / (wider | truth.unsafe).sum())},
+        {"kind": "policy", "variant": TRUE_SET, "seed": -1}
+        | {"volume_ratio": 1.0, "missed_share": 0.0, "iou": 1.0}
+        | flights_of(unsafe_sets.OptimalEvader(sets.constant), starts, truth),
+        {"kind": "policy", "variant": STRAIGHT, "seed": -1}
+        | flights_of(_Straight(), starts, truth),
+    ]
+    return rows
+
+
+def as_scores(comparison: pd.DataFrame, task: str = paper.AIRCRAFT_TASK) -> pd.DataFrame:
+    """The learners' rows as a score table: task, variant, seed, metric, value."""
+    learners = comparison[comparison["kind"] == "learner"].drop(columns=["kind", "covers"])
+    tidy = learners.melt(id_vars=["variant", "seed"], var_name="metric").dropna(subset="value")
+    return tidy.assign(task=task, value=tidy["value"].astype(float))
+
+
+def learned_zetas(comparison: pd.DataFrame, variant: str) -> list[tuple[Floats, float]]:
+    """(zeta, length_scale) of each seed of a variant."""
+    chosen = comparison[(comparison["kind"] == "learner") & (comparison["variant"] == variant)]
+    return [
+        (row[["sigma", "k", "n"]].to_numpy(float), float(row["length_scale"]))
+        for _, row in chosen.sort_values("seed").iterrows()
+    ]
+
+
+def plane(spacing: float) -> tuple[Floats, Floats]:
+    """x [X] and y [Y] of a regular grid over the box where encounters start."""
+    x, y = (
+        np.arange(low, high + spacing / 2, spacing)
+        for low, high in zip(BOX_LOW, BOX_HIGH, strict=True)
+    )
+    return x, y
+
+
+def slices(
+    sets: TrueSets,
+    comparison: pd.DataFrame,
+    measurements: Measurements,
+    degrees: Sequence[float] = (0, 60, 120, 180, 240, 300),
+    spacing: float = 0.1,
+) -> tuple[Floats, Floats, list[Slice]]:
+    """x [X], y [Y] over the box where encounters start, and all unsafe sets at each psi.
+
+    The learned ones are those whose zeta is trained; every set contains the disc. The solved values
+    are kept among ``measurements``.
+    """
+    dynamics = sets.dynamics
+    label, own = sets.kept_as("slices")
+    x, y = plane(spacing)
+    planes = [
+        np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
+        for psi in np.radians(degrees)
+    ]
+    solved = measurements.arrays(
+        "aircraft_slices",
+        label,
+        {"degrees": list(degrees), "spacing": spacing, "solver": reachability.VERSION, **own},
+        lambda: {
+            name: np.stack([solution(states) for states in planes]).astype(np.float32)
+            for name, solution in (("truth", sets.constant), ("adversarial", sets.adversarial))
+        },
+    )
+    zetas = {
+        str(variant): learned_zetas(comparison, str(variant))
+        for variant in comparison["variant"].unique()
+        if not str(variant).startswith("FAC")
+    }
+
+    def claimed(states: Floats, zeta: Sequence[float] | Floats, length_scale: float) -> Floats:
+        phi = unsafe_sets.energy_certificate(dynamics, list(zeta), length_scale)(states)
+        return np.maximum(phi, dynamics.d_min - dynamics.separation(states))
+
+    cuts = []
+    for index, states in enumerate(planes):
+        cuts.append(
+            Slice(
+                psi=float(states[0, 0, 2]),
+                truth=solved["truth"][index],
+                handcrafted=claimed(states, paper.PHI_H, 1.0),
+                learned={
+                    variant: [claimed(states, *learned) for learned in found]
+                    for variant, found in zetas.items()
+                    if found
+                },
+                adversarial=solved["adversarial"][index],
+            )
+        )
+    return x, y, cuts
+
+
+def table_lines(comparison: pd.DataFrame) -> pd.DataFrame:
+    """What a reader sees: learners (mean over seeds and half width of the 95% t interval), then
+    the other rows as they are."""
+    trained = comparison[comparison["kind"] == "learner"]
+    groups = list(trained.groupby("variant", sort=False))
+    groups += [
+        (comparison["variant"][index], comparison.loc[[index]])
+        for index in comparison.index[comparison["kind"] != "learner"]
+    ]
+    lines = []
+    for name, group in groups:
+        seeds = len(group) if (group["kind"] == "learner").any() else 0
+        certified = group["volume_ratio"].notna().any()
+        covering = int(group["covers"].sum())
+        covers = f"{covering} of {seeds}" if seeds else ("no", "yes")[covering]
+        lines.append(
+            {
+                "certificate": name,
+                "seeds": str(seeds or ABSENT),
+                "volume ratio": _cell(group["volume_ratio"], 1, 2),
+                "missed %": _cell(group["missed_share"], 100, 1),
+                "covers": covers if certified else ABSENT,
+                "IoU": _cell(group["iou"], 1, 3),
+                "least ratio": _cell(group["least_volume_ratio"], 1, 2),
+                "infeasible %": _cell(group["infeasible_share"], 100, 1),
+                "at own eta": _cell(group["infeasible_share_eta"], 100, 1),
+                "leak %": _cell(group["leak_share"], 100, 1),
+                "collisions %": _cell(group["collision_share"], 100, 2),
+                "effort": _cell(group["effort"], 1, 2),
+            }
+        )
+    return pd.DataFrame(lines)
+
+
+def comparison_table(
+    comparison: pd.DataFrame,
+    missing: pd.DataFrame | None = None,
+    task: Task = paper.AIRCRAFT_TASK,
+) -> Table:
+    """Learners (mean over seeds and half width of the 95% t interval), then the references."""
+    caption = (
+        f"{name_of(task)}. Unsafe sets against the true one (constant traffic): volume over that "
+        "of the truth; share of the truth minus the collision disc that is missed (covers: at most "
+        f"{100 * COVERS:g}%); least ratio: what the best [sigma, k, n] needs at the same "
+        "share missed, by interpolation; states outside the disc where no turn keeps the "
+        "constraint, with eta 0 and the learner's; states of the claimed safe set that every turn "
+        f"leaves. Deterministic policies from {FLIGHTS:,} truly safe states: flights that collide, "
+        "mean sum of a^2. The policy of a fixed certificate keeps its constraint with the least "
+        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval, "
+        f"or [its ends] where it is cut off at a bound of the quantity. {FEW}"
+    )
+    trained = (comparison["kind"] == "learner").any()
+    notes = [_verdict(as_scores(comparison))] if trained else []
+    if missing is not None and len(missing):
+        notes.append(f"Runs missing: {describe_missing(missing)}.")
+    lines = table_lines(comparison)
+    return Table("aircraft", caption, comparison, lines, tuple(filter(None, notes)))
+
+
+def _verdict(scores: pd.DataFrame) -> str:
+    """What magnitude regularization changed, with Welch's intervals; "" without both learners."""
+    method, rival = paper.LEARNERS
+    texts = []
+    for metric, name, factor, unit in (
+        ("volume_ratio", "volume ratio", 1.0, ""),
+        ("missed_share", "missed share", 100.0, " points"),
+        ("iou", "IoU", 1.0, ""),
+    ):
+        ours, theirs = (
+            factor * statistics.scores_of(scores, paper.AIRCRAFT_TASK, variant, metric)
+            for variant in (method, rival)
+        )
+        gap = statistics.difference_interval(ours, theirs)
+        if np.isnan(gap.mean):
+            return ""
+        interval = "" if np.isnan(gap.low) else f" [{gap.low:+.3f}, {gap.high:+.3f}]"
+        texts.append(f"{name} {gap.mean:+.3f}{interval}{unit}")
+    return f"{method} minus {rival}, Welch's 95% interval: {'; '.join(texts)}."
+
+
+def _cell(values: pd.Series, factor: float, digits: int) -> str:
+    """Shares are multiplied by 100; nothing here is negative, and no share above its whole."""
+    share = factor == 100 or values.name == "iou"
+    estimate = statistics.mean_interval(
+        factor * values.to_numpy(float), bounds=(0.0, factor if share else np.inf)
+    )
+    return ABSENT if np.isnan(estimate.mean) else plus_minus(*estimate[:3], digits)
+
+
+def _certificate(
+    truth: Truth, zeta: Sequence[float] | Floats, length_scale: float, eta: float
+) -> dict[str, float]:
+    phi = unsafe_sets.energy_certificate(truth.dynamics, list(zeta), length_scale)
+    metrics = asdict(unsafe_sets.compare_certificate(truth, phi, eta))
+    return {
+        **dict(zip(("sigma", "k", "n"), map(float, zeta), strict=True)),
+        "length_scale": length_scale,
+        "eta": eta,
+        **{name: metrics[name] for name in COLUMNS},
+    }
+
+
+def _obeying(truth: Truth, zeta: Sequence[float]) -> Obedient:
+    return Obedient(truth.dynamics, unsafe_sets.energy_certificate(truth.dynamics, zeta))
+
+
+def flights_of(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
+    """`safemr.aircraft.unsafe_sets.Flights.summary` of a policy from ``starts`` [N, 3]."""
+    return unsafe_sets.fly(policy, starts, truth.dynamics).summary()

@@ -1,0 +1,363 @@
+"""Falsification of a certificate: a dense, seeded search for states without a safe action.
+
+A state violates feasibility when no action of a stated grid satisfies Eq. cstr0,
+phi(s') - max(phi(s) - eta_D, 0) < 0. A state found is a proof (up to the grid) and can be replayed;
+not finding one proves nothing. The search runs on `PointRobot`, the worst states are confirmed in
+the simulator through the environment's public interface.
+
+States: one obstacle at the origin, the robot at distance d on the -x axis, all other objects far
+away. Five numbers describe such a state of the point robot completely: distance, bearing (angle
+from the nose to the obstacle), course (angle from the obstacle's direction to the velocity), speed
+and turn rate. The search covers d from d_min to where phi < 0 at any speed, all angles, and the
+speeds and turn rates that the actuators reach; states in which the nose is inside a solid obstacle
+are left out. Not every state of this box can be reached by driving, so the shares describe the
+certificate, not an episode; `check_policy` counts what happens in episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safemr.certificates.energy import constraint, energy, largest
+from safemr.certificates.point_robot import ROBOT
+from safemr.errors import UserError
+from safemr.learning.evaluation import Acts
+from safemr.paper import Zeta
+from safemr.tasks import Task, base_of, make_envs, name_of, settings_of, task_settings, traits
+
+Array = NDArray[np.float64]
+Worlds = Mapping[str, NDArray[Any]]  # `envs.get_state()["worlds"]`: arrays with one row a world
+
+COLUMNS = ("distance", "bearing", "course", "speed", "turn_rate")
+FAR_AWAY = 100.0  # m, where the objects stand that play no part
+
+# The action grid: thrust saturates at |a0| = 0.05, so a0 is gridded inside that. The yaw torque is
+# limited too and varies only for a1 within 0.05 of 0.3 psi_dot; there a1 is gridded densely, beside
+# a uniform grid over [-1, 1].
+THRUSTS = np.array([-0.05, -0.025, 0.0, 0.025, 0.05])
+TURNS = np.linspace(-1.0, 1.0, 11)
+SERVO_OFFSETS = np.linspace(-0.06, 0.06, 9)
+
+KEPT, CHILDREN = 32, 32  # refinement: worst states kept, perturbations of each
+CHUNK = 256  # states evaluated at once: what a processor's cache holds, twice as fast as 4,096
+
+
+def action_grid(turn_rates: Array) -> Array:
+    """[S, A, 2] thrusts combined with uniform turns and turns about the servo's zero torque."""
+    near = ROBOT.servo_gain * turn_rates[:, None] + SERVO_OFFSETS
+    uniform = np.broadcast_to(TURNS, (len(turn_rates), len(TURNS)))
+    turns = np.clip(np.concatenate([uniform, near], 1), -1, 1)
+    shape = (len(turn_rates), len(THRUSTS), turns.shape[1])
+    thrusts = np.broadcast_to(THRUSTS[None, :, None], shape)
+    grid = np.stack([thrusts, np.broadcast_to(turns[:, None], shape)], -1)
+    return grid.reshape(len(turn_rates), -1, 2)
+
+
+def energies(states: Array, d_min: float, zeta: Zeta) -> Array:
+    """phi(s) [S] of states [S, 5]."""
+    return energy(states[:, 0], -states[:, 3] * np.cos(states[:, 2]), d_min, *zeta)
+
+
+def grid_margins(states: Array, d_min: float, zeta: Zeta, eta: float) -> Array:
+    """g = phi(s') - max(phi(s) - eta, 0) [S, A] for every action of the grid, by the model."""
+    actions = action_grid(states[:, 4])
+    pose, velocity = _robot(states)
+    count = actions.shape[1]
+    pose, velocity = ROBOT.step(
+        np.repeat(pose, count, 0), np.repeat(velocity, count, 0), actions.reshape(-1, 2)
+    )
+    d = np.hypot(pose[:, 0], pose[:, 1])
+    d_dot = (pose[:, 0] * velocity[:, 0] + pose[:, 1] * velocity[:, 1]) / d
+    phi_next = energy(d, d_dot, d_min, *zeta).reshape(len(states), count)
+    return constraint(energies(states, d_min, zeta)[:, None], phi_next, eta)
+
+
+# --- (b) the search ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Falsification:
+    """Result of a search; shares are of the sampled states, uniform in the five coordinates."""
+
+    task: Task
+    zeta: Zeta
+    eta: float
+    states: Array  # [S, 5]
+    phi: Array  # [S]
+    margin: Array  # [S] least g over the grid; >= 0: no safe action
+    worst_state: Array  # [5] after refinement
+    worst_margin: float  # in the simulator
+    confirmed: int  # of `examined` worst and random states, verdicts that the simulator shares
+    examined: int
+
+    @property
+    def infeasible(self) -> NDArray[np.bool_]:
+        return self.margin >= 0
+
+    @property
+    def infeasible_share(self) -> float:
+        """Share of all states without a safe action."""
+        return float(self.infeasible.mean())
+
+    @property
+    def leak_share(self) -> float:
+        """Share of the states with phi <= 0 that leave the safe set whatever the action."""
+        inside = self.phi <= 0
+        return float(self.infeasible[inside].mean()) if inside.any() else float("nan")
+
+    def example(self) -> dict[str, Any]:
+        """The worst state as plain numbers, enough for `replay`.
+
+        What is not said of the task (base, settings) is that of the registered one.
+        """
+        state = dict(zip(COLUMNS, map(float, self.worst_state), strict=True))
+        name, base = name_of(self.task), base_of(self.task)
+        changed = task_settings(settings_of(self.task))
+        task: dict[str, Any] = {"task": name}
+        task |= {"base": base} if base != name else {}
+        task |= {"settings": changed} if changed else {}
+        return {**task, **self.zeta._asdict(), "eta": self.eta, "state": state,
+                "margin": self.worst_margin}  # fmt: skip
+
+
+def falsify(
+    envs: Any,
+    task: Task,
+    zeta: Zeta,
+    *,
+    eta: float = 0.0,
+    count: int = 2**16,
+    seed: int = 0,
+    rounds: int = 12,
+) -> Falsification:
+    """Search `count` Sobol states, refine the worst, confirm in the simulator.
+
+    envs: `make_simulator` of ``task``. Each round of the refinement perturbs the worst states, with
+    smaller steps than the last, and keeps what is worse. Raises UserError where phi stays positive
+    far from the obstacle, so that the box of states has no end.
+    """
+    from scipy.stats import qmc  # a second, which kept measurements do not need
+
+    d_min = float(envs.d_min)
+    bounds = np.array(
+        [(d_min, largest_distance(zeta, d_min)), (-np.pi, np.pi), (-np.pi, np.pi),
+         (0.0, ROBOT.max_speed), (-ROBOT.max_turn_rate, ROBOT.max_turn_rate)]
+    )  # fmt: skip
+
+    def least(states: Array) -> Array:
+        parts = np.array_split(states, max(1, len(states) // CHUNK))
+        return np.concatenate([grid_margins(part, d_min, zeta, eta).min(1) for part in parts])
+
+    sampler = qmc.Sobol(len(bounds), rng=np.random.default_rng(seed))
+    states = qmc.scale(sampler.random(count), *bounds.T)
+    states = states[~overlaps_obstacle(envs, states)]
+    margin = least(states)
+    generator = np.random.default_rng(seed + 1)
+    order = np.argsort(-margin)[:KEPT]
+    worst, values = states[order], margin[order]
+    for step in 0.1 * 0.7 ** np.arange(rounds):
+        parents = np.repeat(worst, CHILDREN, 0)
+        noise = step * np.ptp(bounds, axis=1) * generator.normal(size=parents.shape)
+        trial = np.clip(parents + noise, *bounds.T)
+        trial = trial[~overlaps_obstacle(envs, trial)]
+        worst, values = np.concatenate([worst, trial]), np.concatenate([values, least(trial)])
+        order = np.argsort(-values)[:KEPT]
+        worst, values = worst[order], values[order]
+    examined = np.concatenate([worst, states[generator.integers(len(states), size=KEPT)]])
+    simulated = simulated_margins(envs, examined, zeta, eta)
+    agree = (simulated >= 0) == (least(examined) >= 0)
+    top = int(simulated.argmax())
+    return Falsification(
+        task=task, zeta=zeta, eta=eta, states=states, phi=energies(states, d_min, zeta),
+        margin=margin, worst_state=examined[top], worst_margin=float(simulated[top]),
+        confirmed=int(agree.sum()), examined=len(examined),
+    )  # fmt: skip
+
+
+def largest_distance(zeta: Zeta, d_min: float) -> float:
+    """Distance beyond which phi < 0 even at full closing speed, and at least 1.5 d_min, m.
+
+    The zero of phi(d, -v_max), found by bisection of `energy`, which falls with d.
+    """
+    low, high = d_min, d_min + 20.0
+    if energy(high, -ROBOT.max_speed, d_min, *zeta) > 0:
+        raise UserError(
+            f"phi is positive {high:.1f} m from the obstacle for sigma, k, n = {tuple(zeta)}: "
+            "no bounded search covers it; use a smaller sigma or k, or a larger n"
+        )
+    for _ in range(60):
+        middle = (low + high) / 2
+        positive = energy(middle, -ROBOT.max_speed, d_min, *zeta) > 0
+        low, high = (middle, high) if positive else (low, middle)
+    return max(high, 1.5 * d_min)
+
+
+def overlaps_obstacle(envs: Any, states: Array) -> NDArray[np.bool_]:
+    """[S] whether the nose (a box ahead of the sphere) is inside a solid obstacle."""
+    if not envs.task.solid_obstacles:
+        return np.zeros(len(states), bool)
+    distance, bearing = states[:, 0], states[:, 1]
+    along = np.abs(distance * np.cos(bearing) - ROBOT.nose_centre) - ROBOT.nose_half
+    across = np.abs(distance * np.sin(bearing)) - ROBOT.nose_half
+    return np.hypot(np.maximum(along, 0), np.maximum(across, 0)) < envs.task.obstacle_size
+
+
+# --- the simulator -------------------------------------------------------------------------------
+
+
+def make_simulator(task: Task, num_envs: int = 128) -> Any:
+    """The task's batched environment. Raises UserError for a task without the point robot."""
+    envs = make_envs(task, num_envs)
+    if not traits(envs).point_robot:
+        raise UserError(f"falsification needs a task of the point robot; {name_of(task)} is none")
+    envs.reset(seed=0)
+    return envs
+
+
+def worlds_near_obstacle(envs: Any, states: Array) -> dict[str, NDArray[Any]]:
+    """States [S, 5] as the simulator's worlds; one obstacle at the origin, the rest far away."""
+    template = envs.get_state()["worlds"]
+    worlds = {name: np.repeat(array[:1], len(states), 0) for name, array in template.items()}
+    pose, velocity = _robot(states)
+    worlds["start"], worlds["goal"][:] = pose, -FAR_AWAY
+    worlds["obstacles"][:], worlds["obstacles"][:, 0] = FAR_AWAY, 0.0
+    # The slide joints turn with the body, so joint velocities are in the frame of the start.
+    cosine, sine = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    qpos, qvel = worlds["qpos"], worlds["qvel"]
+    qpos[:, :3], qvel[:] = 0.0, 0.0
+    qvel[:, 0] = cosine * velocity[:, 0] + sine * velocity[:, 1]
+    qvel[:, 1] = cosine * velocity[:, 1] - sine * velocity[:, 0]
+    qvel[:, 2] = velocity[:, 2]
+    if qpos.shape[1] > 3:  # a box: high up, so that it touches nothing during the step
+        qpos[:, 3:6] = FAR_AWAY
+    worlds["warmstart"][:], worlds["control"][:], worlds["asleep"][:] = 0.0, 0.0, -1
+    return worlds
+
+
+def next_energies(envs: Any, worlds: Worlds, actions: Array, zeta: Zeta) -> Array:
+    """phi(s') [S], the largest over obstacles, one step on from S worlds under actions [S, 2]."""
+    count, size = len(actions), envs.num_envs
+    result = np.empty(count)
+    for begin in range(0, count, size):
+        rows = np.minimum(np.arange(begin, begin + size), count - 1)  # fill up with the last world
+        state = envs.get_state()
+        state["worlds"] = {name: array[rows] for name, array in worlds.items()}
+        state["steps"][:] = 0
+        envs.set_state(state)
+        infos = envs.step(actions[rows])[-1]
+        phi = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        result[begin : begin + size] = phi[: count - begin]
+    return result
+
+
+def simulated_grid(envs: Any, worlds: Worlds, turn_rates: Array, phi: Array, zeta: Zeta,
+                   eta: float) -> tuple[Array, Array]:  # fmt: skip
+    """Actions [S, A, 2] of the grid and g [S, A] in the simulator, for S worlds with phi(s) [S]."""
+    actions = action_grid(turn_rates)
+    count = actions.shape[1]
+    repeated = {name: np.repeat(array, count, 0) for name, array in worlds.items()}
+    phi_next = next_energies(envs, repeated, actions.reshape(-1, 2), zeta)
+    return actions, constraint(phi[:, None], phi_next.reshape(len(phi), count), eta)
+
+
+def simulated_margins(envs: Any, states: Array, zeta: Zeta, eta: float) -> Array:
+    """Least g over the grid [S] in the simulator."""
+    worlds, phi = worlds_near_obstacle(envs, states), energies(states, float(envs.d_min), zeta)
+    return simulated_grid(envs, worlds, states[:, 4], phi, zeta, eta)[1].min(1)
+
+
+def task_of(example: Mapping[str, Any]) -> dict[str, Any]:
+    """The task on which an example was found."""
+    name = str(example["task"])
+    base = {"base": str(example["base"])} if "base" in example else {}
+    return {"name": name, "settings": dict(example.get("settings", {})), **base}
+
+
+def replay(example: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Actions [A, 2] of the grid and their g [A], in the simulator, in an example's state."""
+    zeta = Zeta(example["sigma"], example["k"], example["n"])
+    envs = make_simulator(task_of(example))
+    states = np.array([[float(example["state"][name]) for name in COLUMNS]])
+    worlds, phi = worlds_near_obstacle(envs, states), energies(states, float(envs.d_min), zeta)
+    actions, g = simulated_grid(envs, worlds, states[:, 4], phi, zeta, float(example["eta"]))
+    envs.close()
+    return actions[0], g[0]
+
+
+# --- (c) the trained policy ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PolicyCheck:
+    """How often a policy violated Eq. cstr0, and how often it need not have."""
+
+    steps: int
+    violating: int  # steps with g >= 0
+    examined: int  # violating steps whose action grid was searched
+    avoidable: int  # of these: a safe action existed
+
+    @property
+    def violating_share(self) -> float:
+        return self.violating / self.steps
+
+    @property
+    def avoidable_share(self) -> float:
+        """Share of all steps at which a violating action was picked although a safe one existed."""
+        return self.violating_share * self.avoidable / self.examined if self.examined else 0.0
+
+
+def check_policy(
+    policy: Acts,
+    task: Task,
+    zeta: Zeta,
+    *,
+    eta: float = 0.0,
+    num_envs: int = 32,
+    steps: int = 1000,
+    seed: int = 0,
+    limit: int = 256,
+) -> PolicyCheck:
+    """Run the deterministic policy and search violating steps for a safe action in the simulator.
+
+    At most `limit` of the violating steps, a seeded sample, are searched.
+    """
+    envs = make_simulator(task, num_envs)
+    observations, infos = envs.reset(seed=seed)
+    gyro = envs.observation_layout["gyro"]
+    found: list[tuple[dict[str, NDArray[Any]], float, float]] = []
+    for _ in range(steps):
+        before = envs.get_state()["worlds"]
+        phi = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        turn_rates = observations[:, gyro][:, 2]
+        observations, _, terminated, truncated, infos = envs.step(policy.act(observations))
+        reached = {name: infos[name].copy() for name in ("d", "d_dot")}
+        done = terminated | truncated
+        for name in reached if done.any() else ():
+            reached[name][done] = infos["final_info"][name][done]
+        phi_next = largest(energy(reached["d"], reached["d_dot"], envs.d_min, *zeta))
+        for index in np.flatnonzero(constraint(phi, phi_next, eta) >= 0):
+            world = {name: array[index] for name, array in before.items()}
+            found.append((world, turn_rates[index], phi[index]))
+    envs.close()
+    total = steps * num_envs
+    chosen = np.random.default_rng(seed).permutation(len(found))[:limit]
+    if not len(chosen):
+        return PolicyCheck(total, 0, 0, 0)
+    simulator = make_simulator(task)
+    worlds = {name: np.stack([found[i][0][name] for i in chosen]) for name in found[0][0]}
+    rates, phis = (np.array([found[i][column] for i in chosen]) for column in (1, 2))
+    g = simulated_grid(simulator, worlds, rates, phis, zeta, eta)[1]
+    simulator.close()
+    return PolicyCheck(total, len(found), len(chosen), int((g.min(1) < 0).sum()))
+
+
+def _robot(states: Array) -> tuple[Array, Array]:
+    """World pose [S, 3] and velocity [S, 3] of the robot in states [S, 5]."""
+    distance, bearing, course, speed, turn_rate = states.T
+    pose = np.stack([-distance, np.zeros_like(distance), -bearing], -1)
+    return pose, np.stack([speed * np.cos(course), speed * np.sin(course), turn_rate], -1)

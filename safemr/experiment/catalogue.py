@@ -1,0 +1,134 @@
+"""What there is to choose from: the algorithms in `safemr.algorithms`, their hyperparameters."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import math
+import pkgutil
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from safemr.environments import register_tasks
+from safemr.errors import UserError, show
+from safemr.experiment.config import FAMILIES
+from safemr.learning.hyperparameters import unused
+from safemr.names import unknown
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """What a module of `safemr.algorithms` says about itself."""
+
+    name: str
+    version: int
+    family: str
+    hyperparameters: type[Any]  # the frozen dataclass ``Config``
+    trainer: type[Any]
+
+    @property
+    def settable(self) -> set[str]:
+        """The hyperparameters that change anything: all but the ones declared as not used."""
+        names = {field.name for field in dataclasses.fields(self.hyperparameters) if field.init}
+        return names - unused(self.hyperparameters).keys()
+
+
+def algorithm_names() -> list[str]:
+    """The modules in `safemr.algorithms`: one file is one algorithm."""
+    package = importlib.import_module("safemr.algorithms")
+    return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
+
+
+@functools.cache
+def load_algorithm(name: str, where: str = "") -> Algorithm:
+    """Import an algorithm by name and check the module's contract."""
+    if name not in algorithm_names():
+        raise unknown("algorithm", name, algorithm_names(), where)
+    register_tasks()  # an algorithm may import from that package
+    file = f"safemr/algorithms/{name}.py"
+    try:
+        module = importlib.import_module(f"safemr.algorithms.{name}")
+    except Exception as error:  # whatever is wrong in that file, its author wants to know where
+        reason = str(error).partition("\n")[0]
+        raise UserError(f"{file} does not import: {type(error).__name__}: {reason}") from error
+    for part in ("VERSION", "Config", "Trainer"):
+        if not hasattr(module, part):
+            raise UserError(f"{file} must define {part}")
+    family = getattr(module.Trainer, "family", None)
+    if family not in FAMILIES:
+        raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
+    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer)
+
+
+def hyperparameters(
+    algorithm: Algorithm, overrides: Mapping[str, Any], where: str
+) -> dict[str, Any]:
+    """The complete hyperparameters of an algorithm, defaults included, types and ranges checked."""
+    hints = typing.get_type_hints(algorithm.hyperparameters)
+    names = algorithm.settable
+    values = {}
+    for name, value in overrides.items():
+        if name not in names:
+            raise _not_settable(name, algorithm, where)
+        values[name] = coerce(value, hints[name], f"{where}: {name}")
+    try:
+        complete = algorithm.hyperparameters(**values)
+    except (UserError, ValueError) as error:
+        raise UserError(f"{where}: {error}") from error
+    return dataclasses.asdict(complete)
+
+
+def _not_settable(name: str, algorithm: Algorithm, where: str) -> UserError:
+    """The error for a hyperparameter that an algorithm does not have, or has and does not use."""
+    ignored = unused(algorithm.hyperparameters)
+    if name in ignored:
+        return UserError(
+            f"{where}: {algorithm.name} does not use {name} ({ignored[name]}); leave it out"
+        )
+    users = []
+    for other in algorithm_names():
+        with contextlib.suppress(UserError):  # what another file lacks is no concern here
+            if name in load_algorithm(other).settable:
+                users.append(other)
+    if users:
+        return UserError(
+            f"{where}: {algorithm.name} does not use {name}, which is a hyperparameter of "
+            f"{', '.join(users)}; leave it out"
+        )
+    return unknown("hyperparameter", name, algorithm.settable, f"{where} ({algorithm.name})")
+
+
+def coerce(value: Any, hint: Any, where: str) -> Any:
+    """``value`` as the annotated type, or a UserError. Integers pass as floats, nothing else."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any:
+        return value
+    if origin is typing.Literal:
+        if not any(value == choice and type(value) is type(choice) for choice in arguments):
+            raise unknown("value", value, map(str, arguments), where)
+        return value
+    if origin in (typing.Union, types.UnionType):
+        for option in arguments:
+            try:
+                return coerce(value, option, where)
+            except UserError:
+                continue
+    elif origin in (tuple, list) and isinstance(value, (list, tuple)):
+        variadic = origin is list or arguments[-1:] == (Ellipsis,)
+        types_of = [arguments[0]] * len(value) if variadic else list(arguments)
+        if len(types_of) == len(value):
+            return origin(coerce(v, t, where) for v, t in zip(value, types_of, strict=True))
+    elif hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+        if abs(value) < math.inf and abs(value) < 1e300:
+            return float(value)
+    elif (hint is None or hint is type(None)) and value is None:
+        return None
+    elif hint in (int, str, bool) and type(value) is hint:
+        return value
+    name = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
+    raise UserError(f"{where} must be {name}, not {show(value)}")

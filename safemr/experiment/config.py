@@ -1,0 +1,399 @@
+"""The configuration file: what may be written in it, and clear errors for everything else.
+
+`load` reads ``config/config.yaml`` (and what ``--configfile`` and ``--config`` put over it) into a
+`Config`: structure, types and ranges. Names of tasks, algorithms and hyperparameters are checked
+where they are resolved into runs, in `safemr.experiment.planning`. Nothing here imports torch or an
+environment.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
+from safemr.errors import UserError, show
+from safemr.experiment.sections import (
+    LARGEST_SEED,
+    Section,
+    distinct,
+    flag,
+    integer,
+    labelled,
+    listed,
+    mapping,
+    name_in,
+    number,
+    seeds_in,
+)
+from safemr.experiment.strict_yaml import read_yaml, typed
+from safemr.files import REPOSITORY
+from safemr.names import unknown
+
+FAMILIES = ("off_policy", "on_policy")
+WANDB_MODES = ("disabled", "offline", "online")
+_ROOT = re.compile(r"(/|(\.\./)*)[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
+_SOURCES = {
+    *("benchmarks", "config", "docs", "envs", "examples", "profiles", "safemr", "tests"),
+    "workflow",
+}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One entry of ``algorithms``: a module of `safemr.algorithms` and what differs from it."""
+
+    algorithm: str
+    overrides: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Outside:
+    """An implementation outside `safemr` whose own rule writes the records."""
+
+    algorithm: str
+    version: int
+    steps: int
+    hyperparameters: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class TaskVariant:
+    """A task with a name of its own: a registered one with other settings."""
+
+    base: str
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class TaskOverrides:
+    """What differs on one task, for all algorithms of a family alike.
+
+    ``settings`` are those of its simulation; others make another task, which `TaskVariant` names.
+    """
+
+    settings: Mapping[str, Any]
+    budget: Mapping[str, int]
+    hyperparameters: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Points [a, b] of one variant's regularizer on one task."""
+
+    task: str
+    variant: str
+    points: tuple[tuple[float, float], ...]
+    seeds: tuple[int, ...]
+
+    @property
+    def is_map(self) -> bool:
+        """Whether the points are all pairs of three or more a and three or more b."""
+        a, b = ({point[i] for point in self.points} for i in (0, 1))
+        return min(len(a), len(b)) >= 3 and len(self.points) == len(a) * len(b)
+
+
+@dataclass(frozen=True)
+class Aircraft:
+    """The aircraft experiment: its own learners and seeds."""
+
+    task: str
+    algorithms: Mapping[str, Variant]
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The deterministic evaluation: how often in a run, how many episodes, which first seed."""
+
+    points: int
+    episodes: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class UnseenLayouts:
+    """Final policies on layouts that no run was evaluated on: how many, and the first seed."""
+
+    episodes: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Config:
+    """A validated configuration; see config/config.yaml for the meaning of each key."""
+
+    tasks: tuple[str, ...]
+    task_variants: Mapping[str, TaskVariant]  # of those tasks that are not registered ones
+    algorithms: Mapping[str, Variant]
+    seeds: tuple[int, ...]
+    budget: Mapping[str, int]
+    log_points: int
+    evaluation: Evaluation
+    unseen_layouts: UnseenLayouts | None
+    task_overrides: Mapping[str, TaskOverrides]
+    sensitivity: Sensitivity | None
+    aircraft: Aircraft | None
+    outside: Mapping[str, Outside]
+    results_root: Path
+    figures_root: Path
+    allow_missing: bool
+    wandb_mode: str
+    wandb_project: str
+    cost_tolerance: float
+    zero_violation_share: float
+
+
+def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None) -> Config:
+    """Read configuration files and command-line overrides.
+
+    A later source replaces whole top-level keys of the earlier ones: what a file says about
+    ``algorithms`` is all there is, and what it does not mention stays.
+
+    Raises:
+        UserError: for the first fault, naming it and, for a misspelt name, the nearest valid one.
+    """
+    merged: dict[str, Any] = {}
+    for path in files:
+        merged |= read_yaml(Path(path))
+    return parse(merged | {key: typed(value) for key, value in (overrides or {}).items()})
+
+
+def parse(raw: Any) -> Config:
+    """Check structure, types and ranges of a configuration and return it."""
+    top = Section(raw, "the config", _TOP_LEVEL)
+    evaluation = Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
+    wandb = Section(top.get("wandb", {}), "wandb", ("mode", "project"))
+    safe = Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
+    tasks = _tasks(top.required("tasks"), "tasks")
+    mode = wandb.get("mode", "disabled")
+    if mode not in WANDB_MODES:
+        raise unknown("wandb mode", mode, WANDB_MODES)
+    config = Config(
+        tasks=tuple(tasks),
+        task_variants={name: variant for name, variant in tasks.items() if variant},
+        algorithms=_variants(top.required("algorithms"), "algorithms"),
+        seeds=seeds_in(top.required("seeds"), "seeds"),
+        budget=_budget(top.required("budget"), "budget"),
+        log_points=integer(top.get("log_points", 50), "log_points", 1),
+        evaluation=Evaluation(
+            integer(evaluation.required("points"), "evaluation.points", 1),
+            integer(evaluation.required("episodes"), "evaluation.episodes", 1),
+            integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
+        ),
+        unseen_layouts=_unseen(top.get("unseen_layouts")),
+        task_overrides={
+            name: _task_overrides(value, f"task_overrides.{name}")
+            for name, value in labelled(top.get("task_overrides", {}), "task_overrides")
+        },
+        sensitivity=_sensitivity(top.get("sensitivity"), top.required("seeds")),
+        aircraft=_aircraft(top.get("aircraft"), top.required("seeds")),
+        outside={
+            label: _outside(value, f"outside.{label}")
+            for label, value in labelled(top.get("outside", {}), "outside")
+        },
+        results_root=_root(top.get("results_root", "results"), "results_root"),
+        figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
+        allow_missing=flag(top.get("allow_missing", False), "allow_missing"),
+        wandb_mode=mode,
+        wandb_project=name_in(wandb.get("project", "safemr"), "wandb.project"),
+        cost_tolerance=number(
+            safe.get("cost_tolerance", COST_TOLERANCE), "safe.cost_tolerance", 0, math.inf
+        ),
+        zero_violation_share=number(
+            safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
+        ),
+    )
+    if config.log_points % config.evaluation.points:
+        raise UserError(
+            f"log_points = {config.log_points} must be a multiple of evaluation.points = "
+            f"{config.evaluation.points}"
+        )
+    clash = sorted(config.algorithms.keys() & config.outside.keys())
+    if clash:
+        raise UserError(f"{clash[0]!r} stands both in algorithms and in outside; rename one")
+    if config.sensitivity and config.sensitivity.variant not in config.algorithms:
+        raise unknown("sensitivity.algorithm", config.sensitivity.variant, config.algorithms)
+    return config
+
+
+_TOP_LEVEL = (
+    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
+    *(
+        "unseen_layouts",
+        "sensitivity",
+        "aircraft",
+        "outside",
+        "results_root",
+        "figures_root",
+        "allow_missing",
+    ),
+    *("wandb", "safe"),
+)
+
+
+def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
+    """Names of tasks, and what each is where it is no registered one.
+
+    A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
+    mapping of all names, those of registered tasks with nothing behind them.
+    """
+    entries: list[tuple[Any, Any]] = []
+    if isinstance(value, Mapping):
+        entries += value.items()
+        if not entries:
+            raise UserError(f"{where} is empty")
+    else:
+        for item in listed(value, where):
+            if isinstance(item, Mapping) and len(item) != 1:
+                raise UserError(
+                    f"each of {where} must be a name or one NAME: {{base, settings}}, "
+                    f"not {show(item)}"
+                )
+            entries += item.items() if isinstance(item, Mapping) else [(item, None)]
+    names = [name_in(name, f"each of {where}") for name, _ in entries]
+    distinct([name.lower() for name in names], where)
+    return {
+        name: _task_variant(entry, f"{where}.{name}")
+        for name, (_, entry) in zip(names, entries, strict=True)
+    }
+
+
+def _task_variant(value: Any, where: str) -> TaskVariant | None:
+    if value is None or value == {}:
+        return None
+    section = Section(value, where, ("base", "settings"))
+    return TaskVariant(
+        name_in(section.required("base"), f"{where}.base"),
+        mapping(section.required("settings"), f"{where}.settings"),
+    )
+
+
+def task_name(value: Any, where: str) -> str:
+    """A name that a task may have.
+
+    Raises:
+        UserError: for anything else.
+    """
+    return name_in(value, where)
+
+
+def _budget(value: Any, where: str) -> dict[str, int]:
+    budget = Section(value, where, FAMILIES).value
+    return {name: integer(steps, f"{where}.{name}", 1) for name, steps in budget.items()}
+
+
+def _variants(value: Any, where: str) -> dict[str, Variant]:
+    variants = {}
+    for label, entry in labelled(value, where):
+        settings = dict(mapping(entry, f"{where}.{label}"))
+        if "algorithm" not in settings:
+            near = difflib.get_close_matches("algorithm", settings, n=1)
+            hint = f"; did you mean it by {near[0]!r}?" if near else ""
+            raise UserError(f"{where}.{label} lacks 'algorithm'{hint}")
+        variants[label] = Variant(
+            name_in(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
+        )
+    if not variants:
+        raise UserError(f"{where} is empty")
+    return variants
+
+
+def _task_overrides(value: Any, where: str) -> TaskOverrides:
+    section = Section(value, where, ("settings", "budget", "hyperparameters"))
+    families = Section(section.get("hyperparameters", {}), f"{where}.hyperparameters", FAMILIES)
+    return TaskOverrides(
+        mapping(section.get("settings", {}), f"{where}.settings"),
+        _budget(section.get("budget", {}), f"{where}.budget"),
+        {
+            family: mapping(values, f"{where}.hyperparameters.{family}")
+            for family, values in families.value.items()
+        },
+    )
+
+
+def _unseen(value: Any) -> UnseenLayouts | None:
+    if not value and (value is None or isinstance(value, Mapping)):
+        return None
+    section = Section(value, "unseen_layouts", ("episodes", "seed"))
+    return UnseenLayouts(
+        integer(section.required("episodes"), "unseen_layouts.episodes", 1),
+        integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
+    )
+
+
+def _sensitivity(value: Any, seeds: Any) -> Sensitivity | None:
+    if not value and (value is None or isinstance(value, Mapping)):
+        return None
+    section = Section(value, "sensitivity", ("task", "algorithm", "points", "seeds"))
+    points = []
+    for point in listed(section.required("points"), "sensitivity.points"):
+        if not isinstance(point, (list, tuple)) or len(point) != 2:
+            raise UserError(f"each of sensitivity.points must be a pair [a, b], not {show(point)}")
+        a, b = (number(x, "each number of sensitivity.points", 0) for x in point)
+        points.append((a, b))
+    distinct(points, "sensitivity.points")
+    return Sensitivity(
+        name_in(section.required("task"), "sensitivity.task"),
+        name_in(section.required("algorithm"), "sensitivity.algorithm"),
+        tuple(points),
+        seeds_in(section.get("seeds", seeds), "sensitivity.seeds"),
+    )
+
+
+def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
+    if not value and (value is None or isinstance(value, Mapping)):
+        return None
+    section = Section(value, "aircraft", ("task", "algorithms", "seeds"))
+    return Aircraft(
+        name_in(section.get("task", "Aircraft"), "aircraft.task"),
+        _variants(section.required("algorithms"), "aircraft.algorithms"),
+        seeds_in(section.get("seeds", seeds), "aircraft.seeds"),
+    )
+
+
+def _outside(value: Any, where: str) -> Outside:
+    section = Section(value, where, ("algorithm", "version", "steps", "hyperparameters"))
+    return Outside(
+        name_in(section.required("algorithm"), f"{where}.algorithm"),
+        integer(section.get("version", 1), f"{where}.version", 1),
+        integer(section.required("steps"), f"{where}.steps", 1),
+        mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),
+    )
+
+
+def _root(value: Any, where: str) -> Path:
+    if not isinstance(value, str) or not _ROOT.fullmatch(value):
+        raise UserError(
+            f"{where} must be a path of plain names, from here, from above (../) or from / "
+            f"(no hidden folder, no '..' but at the start), not {show(value)}"
+        )
+    path = Path(value)
+    place = path.resolve()
+    if path.parts[0] in _SOURCES or _among_sources(place):
+        raise UserError(f"{where} = {value!r} lies among the sources; choose another folder")
+    if place in (REPOSITORY, *REPOSITORY.parents, Path.cwd(), *Path.cwd().parents):
+        raise UserError(f"{where} = {value!r} contains the repository; choose a folder beside it")
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{where} = {value!r} is a file; choose a folder")
+    return path
+
+
+def _among_sources(place: Path) -> bool:
+    inside = place.is_relative_to(REPOSITORY)
+    first = place.relative_to(REPOSITORY).parts[:1] if inside else ()
+    return any(name in _SOURCES or name.startswith(".") for name in first)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Check configuration files, each put over the ones before it.
+
+    Raises:
+        UserError: as `load` does.
+    """
+    load(arguments)

@@ -1,0 +1,82 @@
+"""What a dry run announces: the runs that are to be trained, and about how long they take."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from safemr.experiment.planning import Run
+from safemr.experiment.records import PROVENANCE, is_complete
+
+
+class Cost(NamedTuple):
+    """What a recorded run took."""
+
+    task: str
+    hyperparameters: frozenset[str]  # their names, which tell families apart
+    algorithm: str
+    cpu_s_per_step: float
+
+
+def announced(root: Path, runs: Sequence[Run]) -> list[str]:
+    """Lines about those of ``runs`` that have no record under ``root``; none when all have one."""
+    missing = [run for run in runs if not is_complete(root / run.path)]
+    if not missing:
+        return []
+    known = list(_costs(root, (run for run in runs if run not in missing)))
+    seconds = [_estimate(run, known) for run in missing]
+    estimated = sum(value for value in seconds if value is not None)
+    unknown = sum(value is None for value in seconds)
+    time = f"about {_time(estimated)} by the records here"
+    if unknown:
+        time = "for how long no record tells"
+        if estimated:
+            time = f"about {_time(estimated)} and {_count(unknown, 'run')} of unknown length"
+    lines = [f"To be trained: {_count(len(missing), 'run')}, {time}"]
+    for variant in dict.fromkeys(run.variant for run in missing):
+        counts: dict[str, int] = {}
+        for run in missing:
+            if run.variant == variant:
+                counts[run.task] = counts.get(run.task, 0) + 1
+        places = ", ".join(f"{task} {count}" for task, count in counts.items())
+        lines.append(f"  {variant}: {places}")
+    return lines
+
+
+def _costs(root: Path, recorded: Iterable[Run]) -> Iterator[Cost]:
+    for run in recorded:
+        try:
+            seconds = float(json.loads((root / run.path / PROVENANCE).read_text())["cpu_s"])
+        except (OSError, ValueError, KeyError, TypeError):
+            continue  # an outside record need not say it
+        algorithm = run.config["algorithm"]
+        names = frozenset(algorithm["hyperparameters"])
+        yield Cost(run.task, names, algorithm["name"], seconds / run.config["steps"])
+
+
+def _estimate(run: Run, known: Sequence[Cost]) -> float | None:
+    """CPU seconds of a run: the mean a step of the most similar algorithm recorded on its task."""
+    algorithm = run.config["algorithm"]
+    names = set(algorithm["hyperparameters"])
+
+    def similarity(cost: Cost) -> tuple[bool, float]:
+        same = len(names & cost.hyperparameters) / max(len(names | cost.hyperparameters), 1)
+        return cost.algorithm == algorithm["name"], same
+
+    on_task = [cost for cost in known if cost.task == run.task]
+    if not on_task:
+        return None
+    best = max(map(similarity, on_task))
+    rates = [cost.cpu_s_per_step for cost in on_task if similarity(cost) == best]
+    return float(run.config["steps"] * sum(rates) / len(rates))
+
+
+def _time(seconds: float) -> str:
+    minutes = seconds / 60
+    return f"{minutes / 60:.1f} core-hours" if minutes >= 90 else f"{minutes:.0f} core-minutes"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

@@ -1,0 +1,164 @@
+"""The off-policy training loop: act, store, update, written once for every off-policy algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
+from safemr.learning.episode_statistics import EpisodeStatistics
+from safemr.learning.observation import ObservationTransform
+from safemr.learning.policies import Policy
+from safemr.learning.replay import Replay
+
+# Metrics are read off one update in this many: a multiple of every delay in use.
+MEASURE_EVERY = 16
+
+
+class Trainer:
+    """Trains ``agent_type`` (the protocol of `safemr.algorithms.fac.Agent`).
+
+    config: the algorithm's Config; make_envs: number of sub-environments -> batched environment;
+    total_steps: environment steps of the whole run, which the learning-rate schedules span.
+    """
+
+    family: ClassVar[str] = "off_policy"
+    agent_type: ClassVar[Any]
+
+    def __init__(self, config: Any, make_envs: MakeEnvs, seed: int, total_steps: int) -> None:
+        self.config, self.step = config, 0
+        self.envs: Any = make_envs(config.num_envs)
+        space = self.envs.single_action_space
+        if not isinstance(space, gym.spaces.Box):
+            raise TypeError(f"continuous actions are required, found {space}")
+        action_dim = int(np.prod(space.shape))
+        self.transform = ObservationTransform.for_layout(self.envs.observation_layout)
+        updates = max(total_steps - config.start_steps, 0) // config.update_every
+        self.agent = self.agent_type(
+            config, self.transform.dim, action_dim, self.envs.d_min, seed, updates
+        )
+        self.replay = Replay(
+            max(config.replay_capacity // config.num_envs, config.n_step),
+            config.num_envs,
+            self.transform.dim,
+            action_dim,
+            self.envs.num_obstacles,
+            gamma=config.gamma,
+            n_step=config.n_step,
+            device=config.device,
+        )
+        self._sampling = generator(seed, 2)  # rows are drawn on the CPU and looked up on the device
+        self._random_actions = generator(seed, 3)
+        self._held = torch.zeros(config.num_envs, action_dim)
+        self._episodes = EpisodeStatistics(config.num_envs)
+        self._owed = 0.0  # gradient steps earned by experience, not yet done
+        observations, infos = self.envs.reset(seed=environment_seed(seed, 4))
+        self._observations: NDArray[np.float32] = self.transform(observations)
+        self._features = self._energy_features(infos)
+
+    @staticmethod
+    def _energy_features(infos: Mapping[str, Any]) -> NDArray[np.float32]:
+        """d and d_dot side by side, [N, 2 M]."""
+        return np.concatenate((infos["d"], infos["d_dot"]), 1).astype(np.float32)
+
+    def advance(self, until: int) -> dict[str, float]:
+        """Trains until at least ``until`` steps; returns the means over the interval."""
+        config = self.config
+        sums: dict[str, float] = {}
+        counts: dict[str, int] = {}
+        while self.step < until:
+            self._interact()
+            if self.step < config.start_steps:
+                continue
+            self._owed += config.num_envs / config.update_every
+            updates = int(self._owed)
+            if updates < config.updates_together:
+                continue
+            self._owed -= updates
+            drawn = self.replay.sample(updates * config.batch_size, self._sampling)
+            done = self.agent.updates
+            measure = (done + updates) // MEASURE_EVERY > done // MEASURE_EVERY
+            info = self.agent.update(drawn, updates, measure)
+            values = {name: float(value) for name, value in info.items()}
+            check_finite(self.step, values)
+            for name, value in values.items():
+                sums[name] = sums.get(name, 0.0) + value
+                counts[name] = counts.get(name, 0) + 1
+        metrics = {name: total / counts[name] for name, total in sums.items()}
+        metrics |= self.agent.metrics()
+        check_finite(self.step, metrics)
+        return metrics | {f"train_{name}": v for name, v in self._episodes.pop().items()}
+
+    def _interact(self) -> None:
+        """One time step of every sub-environment."""
+        config = self.config
+        device = config.device
+        if self.step < config.start_steps:
+            if self.step % (config.start_hold * config.num_envs) == 0:
+                self._held.uniform_(-1.0, 1.0, generator=self._random_actions)
+            action = self._held
+        else:
+            action = self.agent.act(torch.from_numpy(self._observations).to(device)).cpu()
+            check_finite(self.step, {"action": float(action.sum())})
+        raw, rewards, terminated, truncated, infos = self.envs.step(action.numpy())
+        observations, features = self.transform(raw), self._energy_features(infos)
+        reached, reached_features = observations, features
+        done = terminated | truncated
+        if done.any():
+            # After an autoreset these belong to the new episode; the transition needs the old one.
+            final = infos["final_info"]
+            reached, reached_features = observations.copy(), features.copy()
+            reached[done] = self.transform(infos["final_obs"][done])
+            reached_features[done] = self._energy_features(final)[done]
+        fields = {
+            "observations": self._observations,
+            "next_observations": reached,
+            "rewards": rewards.astype(np.float32),
+            "terminated": terminated.astype(np.float32),
+            "ended": done.astype(np.float32),
+            "costs": np.asarray(infos["cost"], np.float32),
+            "distances": np.concatenate((self._features, reached_features), 1),
+        }
+        tensors = {name: torch.from_numpy(value) for name, value in fields.items()}
+        self.replay.add(actions=action, **tensors)
+        self._episodes.update(rewards, terminated, truncated, infos)
+        self._observations, self._features = observations, features
+        self.step += config.num_envs
+
+    @property
+    def policy(self) -> Policy:
+        """The current policy with what figures need of the run: lambda's network and zeta."""
+        return Policy(self.transform, self.agent.policy, squash=True, extras=self.agent.extras())
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "step": self.step,
+            "owed": self._owed,
+            "agent": self.agent.state_dict(),
+            "replay": self.replay.state_dict(),
+            "sampling": self._sampling.get_state(),
+            "random_actions": self._random_actions.get_state(),
+            "held": self._held,
+            "episodes": self._episodes.state_dict(),
+            "observations": self._observations,
+            "features": self._features,
+            "envs": self.envs.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.step, self._owed = int(state["step"]), float(state["owed"])
+        self.agent.load_state_dict(state["agent"])
+        self.replay.load_state_dict(state["replay"])
+        self._sampling.set_state(torch.as_tensor(state["sampling"]))
+        self._random_actions.set_state(torch.as_tensor(state["random_actions"]))
+        self._held.copy_(torch.as_tensor(state["held"]))
+        self._episodes.load_state_dict(state["episodes"])
+        # np.array keeps the order in memory, which decides how products with them round.
+        self._observations = np.array(state["observations"], np.float32)
+        self._features = np.array(state["features"], np.float32)
+        self.envs.set_state(state["envs"])

@@ -1,0 +1,1 @@
+"""What is measured on finished records, and kept: checks, flights, trajectories, controllers."""

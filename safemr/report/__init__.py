@@ -1,0 +1,1 @@
+"""What is printed and drawn: statistics, tables, claims, and the figures."""

@@ -1,0 +1,245 @@
+"""Aircraft: claimed unsafe sets against the true one, and learners against the frontier.
+
+All sets come as functions on one plane grid, x [X] ahead and y [Y] to the left of the evader in
+metres: ``truth`` is the value V (unsafe where <= 0), the others are unsafe where > 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.ticker import FixedLocator, MultipleLocator, NullLocator
+from numpy.typing import NDArray
+
+from safemr.report.figures import style
+
+Array = NDArray[np.float64]
+
+TRUE = "#B2182B"  # the paper draws the true boundary in red
+_HANDCRAFTED, _HANDCRAFTED_LABEL = "FAC-phih", r"handcrafted $\phi_h$"
+# The left half of an aircraft's outline, nose at the right, one unit long.
+_OUTLINE_X = (0.5, 0.42, 0.12, -0.12, -0.22, -0.1, -0.34, -0.43, -0.5, -0.46)
+_OUTLINE_Y = (0.0, 0.05, 0.06, 0.46, 0.46, 0.06, 0.04, 0.18, 0.18, 0.0)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """Everything at one heading difference psi [rad]; arrays [X, Y]."""
+
+    psi: float
+    truth: Array
+    handcrafted: Array
+    learned: Mapping[str, Sequence[Array]]  # variant -> one array a seed
+    adversarial: Array | None = None  # V against adversarial traffic
+
+
+def draw_aircraft(
+    ax: Axes, x: float, y: float, psi: float, colour: str, length: float = 2.4
+) -> Axes:
+    """An aircraft at (x, y) [m], flying along psi [rad]."""
+    left = np.column_stack([_OUTLINE_X, _OUTLINE_Y])
+    outline = np.concatenate([left, left[-2:0:-1] * [1, -1]])
+    turn = np.array([[np.cos(psi), np.sin(psi)], [-np.sin(psi), np.cos(psi)]])
+    points = style.steady(length * outline @ turn + [x, y])
+    ax.add_patch(Polygon(points, closed=True, fc=colour, ec="white", lw=0.4, zorder=9))
+    return ax
+
+
+def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
+    """Boundaries of all unsafe sets around the evader, which flies to the right."""
+    ax.contourf(x, y, cut.truth.T, levels=[-np.inf, 0], colors=[TRUE], alpha=0.13)
+    ax.add_patch(Circle((0, 0), d_min, fc="0.8", ec="0.35", lw=0.8, alpha=0.9, zorder=2))
+    ax.contour(x, y, cut.truth.T, levels=[0], colors=[TRUE], linewidths=2.0, zorder=4)
+    if cut.adversarial is not None:
+        ax.contour(x, y, cut.adversarial.T, levels=[0], colors=[TRUE], linewidths=0.7,
+                   linestyles=[(0, (4, 2))], zorder=3)  # fmt: skip
+    handcrafted = style.steady(cut.handcrafted)
+    ax.contour(x, y, handcrafted.T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
+               linewidths=1.2, linestyles=[(0, (1.5, 1))], zorder=5)  # fmt: skip
+    for variant in reversed(style.ordered(cut.learned)):
+        for phi in cut.learned[variant]:
+            ax.contour(x, y, style.steady(phi).T, levels=[0], colors=[style.colour(variant)],
+                       linewidths=1.0, linestyles=[_dash(variant)], zorder=6)  # fmt: skip
+    draw_aircraft(ax, 0.0, 0.0, 0.0, "#0072B2")
+    ax.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    ax.xaxis.set_major_locator(MultipleLocator(5))
+    ax.yaxis.set_major_locator(MultipleLocator(5))
+    ax.grid(False)
+    return ax
+
+
+def _dash(variant: str) -> object:
+    """The learners' boundaries often coincide: the rival's dashes let the method's line through."""
+    return "-" if variant == "SafeMR" else (0, (5, 2.5))
+
+
+def _handles(cut: Slice) -> list[Line2D | Patch]:
+    handles: list[Line2D | Patch] = [
+        Patch(fc=(*_rgb(TRUE), 0.13), ec=TRUE, lw=2.0, label="true unsafe set"),
+        *(
+            Line2D([], [], color=style.colour(v), ls=_dash(v), lw=1.0, label=style.label(v))
+            for v in style.ordered(cut.learned)
+        ),
+        Line2D([], [], color=style.colour(_HANDCRAFTED), ls=(0, (1.5, 1)), lw=1.2,
+               label=_HANDCRAFTED_LABEL),
+        Patch(fc="0.8", ec="0.35", lw=0.8, label=r"collision, $d<d_{\min}$"),
+    ]  # fmt: skip
+    if cut.adversarial is not None:
+        handles.append(Line2D([], [], color=TRUE, ls=(0, (4, 2)), lw=0.7,
+                              label="true, adversarial traffic"))  # fmt: skip
+    return handles
+
+
+def _rgb(colour: str) -> tuple[float, ...]:
+    return tuple(int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5))
+
+
+@style.styled
+def slices(x: Array, y: Array, cuts: Sequence[Slice], d_min: float) -> Figure:
+    """One panel a heading difference; the traffic's heading is shown in the corner."""
+    columns = min(3, len(cuts))
+    rows = -(-len(cuts) // columns)
+    figure = style.new_figure(style.TEXT_WIDTH, 1.95 * rows + 0.5)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for ax, cut in zip(axes.flat, cuts, strict=False):
+        draw_slice(ax, x, y, cut, d_min)
+        draw_aircraft(ax, x[-1] - 2.4, y[-1] - 2.4, cut.psi, "0.35")
+        ax.set_title(rf"$\psi={np.degrees(cut.psi):.0f}\degree$")
+    for ax in axes.flat[len(cuts) :]:
+        ax.remove()
+    for ax in axes[-1]:
+        ax.set_xlabel("$x$ ahead (m)")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("$y$ left (m)")
+    figure.legend(handles=_handles(cuts[0]), loc="outside lower center", ncols=4)
+    return figure
+
+
+@style.styled
+def single(x: Array, y: Array, cut: Slice, d_min: float) -> Figure:
+    """The paper's Fig. "airplane": one slice, both aircraft, the boundaries of the unsafe sets."""
+    figure = style.new_figure(style.COLUMN_WIDTH, 3.35)
+    ax = figure.subplots()
+    draw_slice(ax, x, y, cut, d_min)
+    place = (x[-1] - 2.6, y[-1] - 2.2)
+    draw_aircraft(ax, *place, cut.psi, TRUE)
+    for at, angle, tint in (((0.0, 0.0), 0.0, "#0072B2"), (place, cut.psi, TRUE)):
+        tip = style.steady([at[0] + 3.6 * np.cos(angle), at[1] + 3.6 * np.sin(angle)])
+        ax.annotate(
+            "", tuple(tip), at, arrowprops={"arrowstyle": "->", "color": tint, "lw": 0.9}, zorder=8
+        )
+    ax.set(xlabel="$x$ ahead of the evader (m)", ylabel="$y$ to its left (m)")
+    figure.legend(handles=_handles(cut), loc="outside lower center", ncols=2)
+    return figure
+
+
+def draw_frontier(
+    ax: Axes, frontier: pd.DataFrame, comparison: pd.DataFrame, covers: float
+) -> Axes:
+    """Volume ratio against missed share [%], of the best members of the family and of the runs."""
+    ax.axvspan(0, 100 * covers, color="0.93", lw=0)
+    ax.axhline(1, color=TRUE, lw=1.0)
+    ax.fill_between(100 * frontier["missed_share"], 0, frontier["volume_ratio"], fc="none",
+                    ec="0.82", hatch="////", lw=0)  # fmt: skip
+    ax.plot(100 * frontier["missed_share"], frontier["volume_ratio"], color="k", lw=1.4)
+    ax.text(1.15, 0.62, r"out of reach of any $[\sigma,k,n]$",
+            bbox={"fc": "white", "ec": "none", "pad": 1.0})  # fmt: skip
+    looks = {"phi_h": (style.colour("FAC-phih"), "X"), "phi_0": (style.colour("FAC-phi0"), "P"),
+             "code init": ("k", "1")}  # fmt: skip
+    fixed = comparison[comparison["variant"].isin(list(looks))]
+    for _, row in fixed.iterrows():
+        tint, marker = looks[str(row["variant"])]
+        ax.plot(100 * row["missed_share"], row["volume_ratio"], marker=marker, color=tint, ms=6,
+                mec="k" if marker == "1" else "white", mew=1.2 if marker == "1" else 0.5,
+                ls="none", clip_on=False, zorder=4)  # fmt: skip
+    for variant in style.ordered(_moving(comparison)):
+        run = comparison[comparison["variant"] == variant]
+        ax.plot(100 * run["missed_share"], run["volume_ratio"], marker=style.marker(variant),
+                color=style.colour(variant), ms=4.5, mec="white", mew=0.4, ls="none",
+                clip_on=False, zorder=5)  # fmt: skip
+    ax.set_xscale("symlog", linthresh=1.0, linscale=0.7)
+    ax.set_xlim(0, 100)
+    ax.xaxis.set_major_locator(FixedLocator([0, 0.5, 1, 2, 5, 10, 20, 50, 100]))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter("{x:g}")
+    highest = float(pd.concat([comparison["volume_ratio"], frontier["volume_ratio"]]).max())
+    ax.set_ylim(0.5, max(2.0, 1.08 * highest))
+    ax.set(xlabel="share of the true set's shell that is missed (%)", ylabel="volume / true volume")
+    return ax
+
+
+def _moving(comparison: pd.DataFrame) -> list[str]:
+    """Learners whose certificate is learned: with FAC it is the fixed one, drawn already."""
+    learners = comparison[comparison["kind"] == "learner"]
+    names = learners["variant"].unique()
+    return [name for name in names if not str(name).startswith("FAC")]
+
+
+@style.styled
+def frontier(best: pd.DataFrame, comparison: pd.DataFrame, covers: float) -> Figure:
+    """Where each run lies on the trade-off that the energy family allows."""
+    figure = style.new_figure(style.COLUMN_WIDTH, 3.0)
+    draw_frontier(figure.subplots(), best, comparison, covers)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color="k", lw=1.4, label=r"frontier over $[\sigma,k,n]$"),
+        Line2D([], [], color=TRUE, lw=1.0, label="true volume"),
+        *(
+            Line2D([], [], color=style.colour(v), marker=style.marker(v), ls="none", ms=4.5,
+                   label=style.label(v))
+            for v in style.ordered(_moving(comparison))
+        ),
+        Line2D([], [], color=style.colour("FAC-phih"), marker="X", ls="none", ms=6, mec="white",
+               mew=0.5, label=_HANDCRAFTED_LABEL),
+        Line2D([], [], color=style.colour("FAC-phi0"), marker="P", ls="none", ms=6, mec="white",
+               mew=0.5, label=r"distance $\phi_0$"),
+        Line2D([], [], color="k", marker="1", ls="none", ms=6, mew=1.2, label="learners' start"),
+        Patch(fc="0.93", label=f"covers ({100 * covers:g}% missed or less)"),
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    return figure
+
+
+@style.styled
+def neural(
+    x: Array,
+    y: Array,
+    cut: Slice,
+    d_min: float,
+    best: pd.DataFrame,
+    comparison: pd.DataFrame,
+    covers: float,
+) -> Figure:
+    """Neural energies: (a) on the trade-off between volume and coverage, (b) one slice of them.
+
+    ``comparison`` holds rows of kind "learner" and, of kind "control", the curve of the same
+    function fitted to the truth.
+    """
+    figure = style.new_figure(style.TEXT_WIDTH, 3.5)
+    left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.15))
+    draw_frontier(left, best, comparison, covers)
+    control = comparison[comparison["kind"] == "control"].sort_values("missed_share")
+    left.plot(100 * control["missed_share"], control["volume_ratio"], color="k", lw=1.2, ls="--")
+    draw_slice(right, x, y, cut, d_min)
+    draw_aircraft(right, x[-1] - 2.4, y[-1] - 2.4, cut.psi, "0.35")
+    right.set(xlabel="$x$ ahead (m)", ylabel="$y$ left (m)")
+    for ax, letter in ((left, "a"), (right, "b")):
+        style.panel_letter(ax, letter)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color="k", lw=1.4, label=r"frontier over $[\sigma,k,n]$"),
+        Line2D([], [], color="k", lw=1.2, ls="--", label="network fitted to the truth"),
+        *(
+            Line2D([], [], color=style.colour(v), marker=style.marker(v), ms=4.5, lw=1.0,
+                   ls=_dash(v) if v in cut.learned else "none", label=style.label(v))
+            for v in style.ordered(_moving(comparison))
+        ),
+        *_handles(replace(cut, learned={})),
+    ]  # fmt: skip
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
