@@ -1,8 +1,8 @@
 """The ``safemr`` command: one name for the programs of this package.
 
-safemr train ...      train one run (`python -m safemr.experiment.train`)
-safemr evaluate ...   evaluate a recorded policy (`python -m safemr.learning.evaluation`)
-safemr certify ...    check a learned energy function (`python -m safemr.measure.certify`)
+safemr train ...      train one run
+safemr evaluate ...   evaluate a recorded policy
+safemr certify ...    check a learned energy function
 safemr records ...    verify the records under a results root and say what is unfinished
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
@@ -10,36 +10,22 @@ safemr config ...     check configuration files, each put over the ones before i
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import io
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
-from safemr.errors import UserError
+from safemr.errors import reported_errors
 from safemr.names import unknown
 
 # Command -> module with main(arguments) -> exit status, imported only when it is called.
 COMMANDS = {
     "train": "safemr.experiment.train",
-    "evaluate": "safemr.learning.evaluation",
-    "certify": "safemr.measure.certify",
+    "evaluate": "safemr.measure.evaluate",
+    "certify": "safemr.report.certificates",
     "records": "safemr.experiment.overview",
     "list": "safemr.experiment.listing",
     "config": "safemr.experiment.config",
 }
-
-
-@contextlib.contextmanager
-def reported_errors() -> Iterator[None]:
-    """Print a UserError as one line on standard error and exit with its status (2)."""
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a letter that the terminal lacks stops nothing
-        sys.stdout.reconfigure(errors="backslashreplace")
-    try:
-        yield
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise SystemExit(getattr(error, "exit_code", 2)) from None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

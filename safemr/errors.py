@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import sys
+from collections.abc import Iterator
 from typing import Any, TextIO
 
 
@@ -29,3 +31,15 @@ def show(value: Any) -> str:
     """A short one-line picture of any value for an error message."""
     text = ascii(value)
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+@contextlib.contextmanager
+def reported_errors() -> Iterator[None]:
+    """Print a UserError as one line on standard error and exit with its status (2)."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a letter that the terminal lacks stops nothing
+        sys.stdout.reconfigure(errors="backslashreplace")
+    try:
+        yield
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(getattr(error, "exit_code", 2)) from None

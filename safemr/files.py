@@ -17,6 +17,7 @@ from safemr.errors import UserError
 
 Arrays = Mapping[str, NDArray[Any]]
 
+POLICY = "policy.npz"  # in a record: the trained policy, which is optional
 REPOSITORY = Path(__file__).resolve().parents[1]  # the folder that holds the packages
 
 
@@ -62,6 +63,20 @@ def load_arrays(path: Path | str) -> Arrays:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is not a readable archive of arrays: {error}") from error
+
+
+def policy_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused.
+
+    Raises UserError where there is no such file, or none that can be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such policy; train the run first") from error
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"{path} is not a readable policy file: {error}") from error
 
 
 def _sync_directory(folder: Path) -> None:

@@ -24,6 +24,7 @@ from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
 from safemr.measure.store import Measurements
+from safemr.report import aircraft as tables
 from safemr.report import statistics
 from safemr.report.figures import aircraft as pictures
 from safemr.report.figures import style
@@ -170,7 +171,7 @@ def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
         columns=["task", "variant", "seed"],
     )
     missing = statistics.missing_runs(expected, index[1])
-    table = scoring.comparison_table(comparison, missing)
+    table = tables.comparison_table(comparison, missing)
     assert table.notes[-1] == "Runs missing: SafeMR on Aircraft (seeds 102, 103)."
     shown = table.display.set_index("certificate")
     ours = comparison[comparison["variant"] == "SafeMR"]
@@ -199,7 +200,7 @@ def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
 def test_without_any_run_the_references_remain(sets: TrueSets, tmp_path: Path) -> None:
     none = pd.DataFrame(columns=["task", "variant", "seed", "folder"])
     comparison = scoring.compare(sets, FRONTIER, tmp_path, none, flights=20)
-    table = scoring.comparison_table(comparison, none)
+    table = tables.comparison_table(comparison, none)
     assert table.notes == ()
     assert set(scoring.CERTIFICATES) <= set(table.display["certificate"])
     pictures.frontier(FRONTIER, comparison, COVERS)
@@ -349,7 +350,7 @@ def test_a_record_is_held_against_the_true_set_of_its_own_traffic(
     ]
     for metric in ("volume_ratio", "missed_share", "iou"):
         assert ours[metric] == pytest.approx(straight[metric], abs=0.02)
-    assert scoring.comparison_table(found, task=MIRRORED).caption.startswith("Aircraft-left. ")
+    assert tables.comparison_table(found, task=MIRRORED).caption.startswith("Aircraft-left. ")
 
 
 def test_kept_measurements_of_the_registered_traffic_keep_their_names(

@@ -169,6 +169,8 @@ def test_the_revision_is_known_in_a_clone_of_another_owner(tmp_path: Path) -> No
 def test_letters_that_a_terminal_lacks_stop_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "données"
     folder.mkdir()
-    code = "from safemr.cli import reported_errors\nwith reported_errors():\n    print('données')"
+    code = (
+        "from safemr.errors import reported_errors\nwith reported_errors():\n    print('données')"
+    )
     done = python("-c", code, cwd=folder, PYTHONIOENCODING="ascii")
     assert (done.returncode, done.stdout.strip()) == (0, "donn\\xe9es")

@@ -21,8 +21,10 @@ from safemr.certificates.point_robot import PointRobot
 from safemr.errors import UserError
 from safemr.experiment import records
 from safemr.measure import certify
+from safemr.measure.policy_check import check_policy
 from safemr.measure.store import Measurements
 from safemr.paper import Zeta
+from safemr.report import certificates
 
 ROOT = Path(__file__).resolve().parents[1]
 LEARNED = list(paper.TABLE_II.values())
@@ -203,13 +205,11 @@ class Constant:
 
 def test_a_resting_robot_never_violates_and_a_rammer_could_have_done_otherwise():
     task = TASK
-    resting = falsification.check_policy(Constant(0, 0), task, LEARNED[0], num_envs=4, steps=20)
+    resting = check_policy(Constant(0, 0), task, LEARNED[0], num_envs=4, steps=20)
     assert resting.steps == 80
     assert resting.violating == 0
     assert resting.avoidable_share == 0.0
-    ramming = falsification.check_policy(
-        Constant(1, 0), task, LEARNED[0], num_envs=16, steps=120, limit=20
-    )
+    ramming = check_policy(Constant(1, 0), task, LEARNED[0], num_envs=16, steps=120, limit=20)
     assert ramming.violating > 0
     assert ramming.examined == min(20, ramming.violating)
     assert ramming.avoidable >= 0.8 * ramming.examined
@@ -222,14 +222,14 @@ def test_a_resting_robot_never_violates_and_a_rammer_could_have_done_otherwise()
 def test_command_prints_four_verdicts_and_writes_table_picture_and_examples(tmp_path, capsys):
     arguments = ["--sigma", "0.2", "--k", "0.8", "--n", "2.1", "--name", "mine",
                  "--states", "256", "--out", str(tmp_path)]  # fmt: skip
-    assert certify.main(arguments) == 0
+    assert certificates.main(arguments) == 0
     printed = capsys.readouterr().out
     assert printed.count("holds (") == 2
     assert printed.count("fails (") == 2
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"certificates.csv", "certificates.md", "certificates.tex",
                      "certificates.pdf", "certificates.png", "examples.json"}  # fmt: skip
-    assert certify.main(["--replay", str(tmp_path / "examples.json")]) == 0
+    assert certificates.main(["--replay", str(tmp_path / "examples.json")]) == 0
     assert "mine on Pillars-0.15-Goal: 100 actions" in capsys.readouterr().out
 
 
@@ -254,7 +254,7 @@ def test_without_parameters_the_papers_certificates_are_checked():
 )  # fmt: skip
 def test_bad_requests_are_named(arguments, culprit):
     with pytest.raises(UserError, match=culprit):
-        certify.main([*arguments, "--states", "64"])
+        certificates.main([*arguments, "--states", "64"])
 
 
 # --- a task with other settings ------------------------------------------------------------------
@@ -293,9 +293,9 @@ def test_the_search_covers_the_distances_of_the_settings():
 
 def test_the_command_line_and_a_record_certify_the_same_task(tmp_path, capsys):
     folder = record_on(tmp_path, LARGE)
-    assert certify.main(["--record", str(folder), "--states", "256"]) == 0
+    assert certificates.main(["--record", str(folder), "--states", "256"]) == 0
     recorded = capsys.readouterr().out
-    assert certify.main([*ZETA, "--set", "task.obstacle_size=0.3"]) == 0
+    assert certificates.main([*ZETA, "--set", "task.obstacle_size=0.3"]) == 0
     given = capsys.readouterr().out
     assert "| Large |" in recorded
     assert "| Pillars-0.15-Goal with obstacle_size=0.3 |" in given
@@ -311,10 +311,10 @@ def test_the_command_line_and_a_record_certify_the_same_task(tmp_path, capsys):
 
 def test_a_replay_is_on_the_task_of_its_example_and_on_no_other(tmp_path, capsys):
     settings = ["--set", "task.obstacle_size=0.3"]
-    certify.main([*ZETA, *settings, "--out", str(tmp_path)])
+    certificates.main([*ZETA, *settings, "--out", str(tmp_path)])
     file = tmp_path / "examples.json"
     for matching in ([], settings, [*settings, "--task", TASK]):
-        assert certify.main(["--replay", str(file), *matching]) == 0
+        assert certificates.main(["--replay", str(file), *matching]) == 0
     assert "the file says" not in capsys.readouterr().out
     title = "mine on Pillars-0.15-Goal with obstacle_size=0.3"
     for other, named in (
@@ -323,7 +323,7 @@ def test_a_replay_is_on_the_task_of_its_example_and_on_no_other(tmp_path, capsys
         (["--task", TASK], "Pillars-0.15-Goal"),
     ):
         with pytest.raises(UserError) as caught:
-            certify.main(["--replay", str(file), *other])
+            certificates.main(["--replay", str(file), *other])
         message = f"{title} is an example of {title.removeprefix('mine on ')}, not of {named}"
         assert str(caught.value).endswith(message)
     # A file of before, which forgot the settings: it does not come out as it says.
@@ -331,17 +331,17 @@ def test_a_replay_is_on_the_task_of_its_example_and_on_no_other(tmp_path, capsys
     del example["settings"], example["base"]
     example["task"] = TASK
     file.write_text(json.dumps({name: example}))
-    assert certify.main(["--replay", str(file)]) == 1
+    assert certificates.main(["--replay", str(file)]) == 1
     assert "the file says" in capsys.readouterr().out
     example["settings"] = {"obstacle_sise": 0.3}
     file.write_text(json.dumps({name: example}))
     with pytest.raises(UserError, match="obstacle_size"):
-        certify.main(["--replay", str(file)])
+        certificates.main(["--replay", str(file)])
 
 
 def test_the_examples_that_the_repository_keeps_come_out_as_they_say(capsys):
     file = ROOT / "results/tables/certificate_examples.json"
-    assert certify.main(["--replay", str(file)]) == 0
+    assert certificates.main(["--replay", str(file)]) == 0
     assert capsys.readouterr().out.count("no action is safe") == len(json.loads(file.read_text()))
 
 
@@ -377,6 +377,6 @@ def test_a_neural_record_is_not_certified_as_its_fixed_part(tmp_path, by):
     else:  # an algorithm of somebody else's, that saves such a network
         folder = record_on(tmp_path, task, "fac", certificate_parameters=np.zeros(3))
     with pytest.raises(UserError, match=r"is a network beside a fixed \[sigma, k, n\]") as caught:
-        certify.main(["--record", str(folder)])
+        certificates.main(["--record", str(folder)])
     assert str(folder) in str(caught.value)
     assert "--sigma --k --n" in str(caught.value)

@@ -78,12 +78,12 @@ def test_no_file_can_run_code(tmp_path: Path) -> None:
     np.savez(policy, allow_pickle=True, weights=np.array([Malicious(target)], dtype=object))
     torch.save({"state": Malicious(target)}, checkpoint)
     with pytest.raises(UserError, match=r"policy\.npz is not a readable policy"):
-        records.policy_arrays(policy)
+        files.policy_arrays(policy)
     with pytest.raises(UserError, match=r"checkpoint\.pt is not a readable checkpoint"):
         checkpoints.load(checkpoint)
     policy.write_bytes(pickle.dumps(Malicious(target)))
     with pytest.raises(UserError):
-        records.policy_arrays(policy)
+        files.policy_arrays(policy)
     assert not target.exists()
 
 

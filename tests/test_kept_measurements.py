@@ -28,8 +28,7 @@ import pytest
 from safemr import files
 from safemr.aircraft import neural, scoring
 from safemr.experiment import records
-from safemr.learning import evaluation
-from safemr.measure import certify, controllers, store, trajectories
+from safemr.measure import certify, controllers, evaluate, store, trajectories
 from safemr.measure.store import HEADER, Measurements
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -96,7 +95,7 @@ def the_rollouts(again: Again) -> None:
 
 def unseen_layouts(again: Again) -> None:
     inputs = again.kept("unseen_layouts", f"{TASK}-SafeMR-seed0")[1]["inputs"]
-    evaluation.measured(
+    evaluate.measured(
         again.measurements, again.record(inputs), episodes=inputs["episodes"], seed=inputs["seed"]
     )
 

@@ -14,7 +14,7 @@ from safemr.algorithms import fac, joint_sis, sac_lagrangian, safemr
 from safemr.learning import numba_kernels, numba_steps
 from safemr.learning.networks import ACTIVATIONS, StackedMLP
 from safemr.learning.replay import Batch, Replay
-from safemr.learning.torch_steps import AutogradSteps
+from safemr.learning.torch_steps import TorchSteps
 
 MODULES = (fac, joint_sis, safemr, sac_lagrangian)
 OBSERVATIONS, ACTIONS, OBSTACLES, BATCH, PARTS = 5, 2, 3, 24, 4
@@ -134,10 +134,10 @@ def test_state_moves_between_backends() -> None:
 def test_choice_of_the_backend() -> None:
     """A device other than the CPU has no compiled kernels."""
     agent = make(fac, "fused")
-    assert type(agent.steps) is numba_steps.FusedSteps
-    assert type(make(fac, "torch").steps) is AutogradSteps
+    assert type(agent.backend) is numba_steps.NumbaSteps
+    assert type(make(fac, "torch").backend) is TorchSteps
     agent.config = dataclasses.replace(agent.config, device="cuda")
-    assert type(agent._make_steps()) is AutogradSteps
+    assert type(agent._make_backend()) is TorchSteps
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)

@@ -23,6 +23,7 @@ from safemr.errors import UserError
 from safemr.experiment import planning, records
 from safemr.learning.policies import Policy
 from safemr.learning.replay import Batch
+from safemr.report.aircraft import neural_table
 from safemr.report.figures import aircraft as pictures
 
 ZETA = {"sigma": 0.06, "k": 1.0, "n": 1.0, "length_scale": 5.0}
@@ -242,7 +243,7 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
     assert (curve["missed_share"] <= np.array(neural.CONTROL_SHARES)).all()
 
     missing = pd.DataFrame([("Aircraft", "Neural-a9", 100)], columns=["task", "variant", "seed"])
-    table = neural.comparison_table(rows, missing)
+    table = neural_table(rows, missing)
     assert table.display["certificate"].tolist() == [
         "Neural-a1",
         neural.CONTROL,

@@ -13,6 +13,7 @@ from toy import ToyEnvs
 
 from safemr.algorithms import fac, joint_sis, safemr
 from safemr.errors import UserError
+from safemr.learning import losses
 from safemr.learning.contract import TrainingDivergedError
 from safemr.learning.evaluation import evaluate
 from safemr.learning.replay import Batch
@@ -50,7 +51,7 @@ def transitions(count: int = 6, seed: int = 0, d_min: float = 0.25) -> Batch:
 
 
 def test_reward_target_by_hand():
-    target = fac.reward_target(
+    target = losses.reward_target(
         returns=torch.tensor([1.0, 2.0]),
         discounts=torch.tensor([0.9, 0.0]),
         next_values=torch.tensor([[3.0, 7.0], [4.0, 5.0]]),
@@ -63,8 +64,8 @@ def test_reward_target_by_hand():
 
 def test_losses_by_hand():
     predictions, targets = torch.tensor([[1.0, 2.0], [0.0, 0.0]]), torch.tensor([[0.0, 0.0]] * 2)
-    assert fac.critic_loss(predictions, targets).item() == pytest.approx(2.5)
-    loss = fac.policy_loss(
+    assert losses.critic_loss(predictions, targets).item() == pytest.approx(2.5)
+    loss = losses.policy_loss(
         log_densities=torch.tensor([-1.0, 1.0]),
         values=torch.tensor([[2.0, 5.0], [3.0, 4.0]]),
         constraint=torch.tensor([0.5, -0.5]),
@@ -74,11 +75,11 @@ def test_losses_by_hand():
     # mean of (-0.1 - 2 + 5) and (0.1 - 4 - 0.5)
     assert loss.item() == pytest.approx((2.9 - 4.4) / 2)
     multipliers = torch.tensor([2.0, 4.0], requires_grad=True)
-    fac.multiplier_loss(multipliers, torch.tensor([0.5, -0.25])).backward()
+    losses.multiplier_loss(multipliers, torch.tensor([0.5, -0.25])).backward()
     # descent on this loss raises lambda where the constraint is violated and lowers it elsewhere
     assert multipliers.grad.tolist() == [-0.25, 0.125]
     log_temperature = torch.tensor(0.0, requires_grad=True)
-    fac.temperature_loss(log_temperature, torch.tensor([3.0, 1.0]), -1.0).backward()
+    losses.temperature_loss(log_temperature, torch.tensor([3.0, 1.0]), -1.0).backward()
     # entropy -2 is below the target -1: the gradient is negative, so the temperature rises
     assert log_temperature.grad.item() == -1.0
 

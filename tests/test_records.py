@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sample_record import CONFIG, POLICY, make_record
 
+from safemr import files
 from safemr.experiment import overview, records
 from safemr.experiment.checkpoints import RunSession
 from safemr.experiment.records import RecordError
-from safemr.learning import evaluation
-from safemr.measure import certify
+from safemr.measure import certify, evaluate
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_a_written_record_is_verified_and_read(record: Path, tmp_path: Path) -> 
     assert list(progress) == ["task", "variant", "seed", "step", "metric", "value"]
     assert len(progress) == 6
     np.testing.assert_array_equal(
-        records.policy_arrays(record / "policy.npz")["weights"], POLICY["weights"]
+        files.policy_arrays(record / "policy.npz")["weights"], POLICY["weights"]
     )
 
 
@@ -190,7 +190,7 @@ def test_nothing_but_a_record_is_ever_advised_to_be_removed(record: Path, tmp_pa
     for kind, folder in foreign_folders(tmp_path, record).items():
         for read in (
             records.verify_record,
-            evaluation.evaluate_record,
+            evaluate.evaluate_record,
             certify.certificate_of_record,
         ):
             with pytest.raises(RecordError) as caught:

@@ -20,9 +20,10 @@ from safemr.learning import evaluation
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
-from safemr.measure import unseen_layouts
+from safemr.measure import evaluate, unseen_layouts
 from safemr.measure.store import Measurements
 from safemr.report import statistics
+from safemr.report.unseen_layouts import table
 
 TASK = "Pillars-0.15-Goal"
 
@@ -79,7 +80,7 @@ def test_a_record_without_a_policy_is_named(
 ) -> None:
     folder = make_record(tmp_path)
     with pytest.raises(UserError, match="not a policy"):
-        evaluation.evaluate_record(folder, episodes=1)
+        evaluate.evaluate_record(folder, episodes=1)
     (folder / "policy.npz").unlink()
     scores = unseen_layouts.measured_scores(Measurements(tmp_path), [folder], episodes=1, seed=0)
     assert scores.empty
@@ -116,7 +117,7 @@ def score_table(**values: list[float]) -> pd.DataFrame:
 def test_the_table_counts_episodes_with_violations() -> None:
     flown = score_table(SafeMR=[10.0, 11.0, 12.0], CPO=[20.0, 20.0, 20.0])
     before = score_table(SafeMR=[9.0, 9.0, 9.0])
-    data = unseen_layouts.table(flown, before, episodes=20).data.set_index("variant")
+    data = table(flown, before, episodes=20).data.set_index("variant")
     ours, cpo = data.loc["SafeMR"], data.loc["CPO"]
     assert (ours["violating_episodes"], ours["episodes"], ours["safe"]) == (0, 60, True)
     assert (cpo["violating_episodes"], cpo["episodes"], cpo["safe"]) == (6, 60, False)

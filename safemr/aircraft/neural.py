@@ -23,19 +23,18 @@ from safemr import paper
 from safemr.aircraft import reachability, scoring, unsafe_sets
 from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
-from safemr.aircraft.scoring import TrueSets
+from safemr.aircraft.scoring import TrueSets, learners
+from safemr.aircraft.slices import Slice
 from safemr.aircraft.unsafe_sets import Certificate, Truth
 from safemr.algorithms.neural_safemr import neural_energy
 from safemr.conventions import COVERS
 from safemr.experiment.planning import installed
-from safemr.experiment.recorded_energy import NETWORK, learners
+from safemr.experiment.recorded_energy import NETWORK
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy, network_from_arrays
 from safemr.measure.store import VERSIONS, Measurements, record_inputs
 from safemr.measure.tracks import below
-from safemr.report.figures.aircraft import Slice
-from safemr.report.tables import Table, describe_missing
 
 CONTROL = "fit to the truth"
 CONTROL_SHARES = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
@@ -258,23 +257,6 @@ def measured(
     learned = {name: [values] for name, values in below(kept, "learned/").items()}
     cut = Slice(float(np.radians(SLICE)), kept["truth"], kept["handcrafted"], learned)
     return comparison, *scoring.plane(SPACING), cut
-
-
-def comparison_table(comparison: pd.DataFrame, missing: pd.DataFrame) -> Table:
-    """Learners (mean and 95% t interval over seeds), then the control."""
-    shown = comparison[comparison["kind"] != "control"]
-    caption = (
-        "Aircraft, neural energy functions: columns as in the aircraft table; least ratio is what "
-        "the best [sigma, k, n] needs at the same share missed; obeyed: collisions of the policy "
-        "that keeps the constraint with the least turn, or violates it least. "
-        f"{CONTROL.capitalize()}: the same function by supervised learning on the solved value, "
-        f"as it is and shifted to miss {100 * COVERS:g}%."
-    )
-    lines = scoring.table_lines(shown).drop(columns="at own eta")
-    obeyed = shown.assign(collision_share=shown["obeyed_collision_share"])
-    lines["obeyed %"] = scoring.table_lines(obeyed)["collisions %"]
-    notes = [f"Runs missing: {describe_missing(missing)}."] if len(missing) else []
-    return Table("aircraft_neural", caption, comparison, lines, tuple(notes))
 
 
 def slice_at(

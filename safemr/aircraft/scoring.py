@@ -11,10 +11,11 @@ apply to a row is nan.
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -25,17 +26,21 @@ from safemr import paper
 from safemr.aircraft import reachability, unsafe_sets
 from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
+from safemr.aircraft.slices import Slice
 from safemr.aircraft.unsafe_sets import Truth
 from safemr.certificates.energy import constraint
 from safemr.conventions import COVERS
+from safemr.errors import UserError
 from safemr.experiment.planning import installed
-from safemr.experiment.recorded_energy import Saved, learners
+from safemr.experiment.recorded_energy import NETWORK, require_zeta
+from safemr.experiment.records import CONFIG
+from safemr.files import POLICY, policy_arrays
 from safemr.learning.evaluation import Acts
 from safemr.measure.store import Measurements, record_inputs, record_label
-from safemr.report import statistics
-from safemr.report.figures.aircraft import Slice
-from safemr.report.tables import ABSENT, FEW, Table, describe_missing, plus_minus
 from safemr.tasks import Task, name_of
+
+if TYPE_CHECKING:
+    from safemr.learning.policies import Policy
 
 FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
 MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -298,95 +303,6 @@ def slices(
     return x, y, cuts
 
 
-def table_lines(comparison: pd.DataFrame) -> pd.DataFrame:
-    """What a reader sees: learners (mean over seeds and half width of the 95% t interval), then
-    the other rows as they are."""
-    trained = comparison[comparison["kind"] == "learner"]
-    groups = list(trained.groupby("variant", sort=False))
-    groups += [
-        (comparison["variant"][index], comparison.loc[[index]])
-        for index in comparison.index[comparison["kind"] != "learner"]
-    ]
-    lines = []
-    for name, group in groups:
-        seeds = len(group) if (group["kind"] == "learner").any() else 0
-        certified = group["volume_ratio"].notna().any()
-        covering = int(group["covers"].sum())
-        covers = f"{covering} of {seeds}" if seeds else ("no", "yes")[covering]
-        lines.append(
-            {
-                "certificate": name,
-                "seeds": str(seeds or ABSENT),
-                "volume ratio": _cell(group["volume_ratio"], 1, 2),
-                "missed %": _cell(group["missed_share"], 100, 1),
-                "covers": covers if certified else ABSENT,
-                "IoU": _cell(group["iou"], 1, 3),
-                "least ratio": _cell(group["least_volume_ratio"], 1, 2),
-                "infeasible %": _cell(group["infeasible_share"], 100, 1),
-                "at own eta": _cell(group["infeasible_share_eta"], 100, 1),
-                "leak %": _cell(group["leak_share"], 100, 1),
-                "collisions %": _cell(group["collision_share"], 100, 2),
-                "effort": _cell(group["effort"], 1, 2),
-            }
-        )
-    return pd.DataFrame(lines)
-
-
-def comparison_table(
-    comparison: pd.DataFrame,
-    missing: pd.DataFrame | None = None,
-    task: Task = paper.AIRCRAFT_TASK,
-) -> Table:
-    """Learners (mean over seeds and half width of the 95% t interval), then the references."""
-    caption = (
-        f"{name_of(task)}. Unsafe sets against the true one (constant traffic): volume over that "
-        "of the truth; share of the truth minus the collision disc that is missed (covers: at most "
-        f"{100 * COVERS:g}%); least ratio: what the best [sigma, k, n] needs at the same "
-        "share missed, by interpolation; states outside the disc where no turn keeps the "
-        "constraint, with eta 0 and the learner's; states of the claimed safe set that every turn "
-        f"leaves. Deterministic policies from {FLIGHTS:,} truly safe states: flights that collide, "
-        "mean sum of a^2. The policy of a fixed certificate keeps its constraint with the least "
-        "turn, or violates it least. Learners: mean over seeds ± half width of the 95% t interval, "
-        f"or [its ends] where it is cut off at a bound of the quantity. {FEW}"
-    )
-    trained = (comparison["kind"] == "learner").any()
-    notes = [_verdict(as_scores(comparison))] if trained else []
-    if missing is not None and len(missing):
-        notes.append(f"Runs missing: {describe_missing(missing)}.")
-    lines = table_lines(comparison)
-    return Table("aircraft", caption, comparison, lines, tuple(filter(None, notes)))
-
-
-def _verdict(scores: pd.DataFrame) -> str:
-    """What magnitude regularization changed, with Welch's intervals; "" without both learners."""
-    method, rival = paper.LEARNERS
-    texts = []
-    for metric, name, factor, unit in (
-        ("volume_ratio", "volume ratio", 1.0, ""),
-        ("missed_share", "missed share", 100.0, " points"),
-        ("iou", "IoU", 1.0, ""),
-    ):
-        ours, theirs = (
-            factor * statistics.scores_of(scores, paper.AIRCRAFT_TASK, variant, metric)
-            for variant in (method, rival)
-        )
-        gap = statistics.difference_interval(ours, theirs)
-        if np.isnan(gap.mean):
-            return ""
-        interval = "" if np.isnan(gap.low) else f" [{gap.low:+.3f}, {gap.high:+.3f}]"
-        texts.append(f"{name} {gap.mean:+.3f}{interval}{unit}")
-    return f"{method} minus {rival}, Welch's 95% interval: {'; '.join(texts)}."
-
-
-def _cell(values: pd.Series, factor: float, digits: int) -> str:
-    """Shares are multiplied by 100; nothing here is negative, and no share above its whole."""
-    share = factor == 100 or values.name == "iou"
-    estimate = statistics.mean_interval(
-        factor * values.to_numpy(float), bounds=(0.0, factor if share else np.inf)
-    )
-    return ABSENT if np.isnan(estimate.mean) else plus_minus(*estimate[:3], digits)
-
-
 def _certificate(
     truth: Truth, zeta: Sequence[float] | Floats, length_scale: float, eta: float
 ) -> dict[str, float]:
@@ -407,3 +323,63 @@ def _obeying(truth: Truth, zeta: Sequence[float]) -> Obedient:
 def flights_of(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
     """`safemr.aircraft.unsafe_sets.Flights.summary` of a policy from ``starts`` [N, 3]."""
     return unsafe_sets.fly(policy, starts, truth.dynamics).summary()
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What a record says of its certificate."""
+
+    folder: Path
+    zeta: NDArray[np.float64]  # [3] in units of length_scale
+    length_scale: float  # [m]
+    eta: float
+
+    def policy(self) -> Policy:
+        # torch, which kept measurements do not need
+        from safemr.learning.policies import load_policy
+
+        return load_policy(self.folder)
+
+
+def learners(
+    root: Path,
+    runs: pd.DataFrame,
+    dynamics: AircraftDynamics,
+    needed: Sequence[str] = ("zeta", "length_scale"),
+) -> Sequence[tuple[Any, Saved]]:
+    """(run, what is saved of its certificate) of every record.
+
+    Raises UserError naming every record whose policy file lacks an array of ``needed``, or one that
+    flew in other traffic than ``dynamics``, or whose phi is a network that is not ``needed``.
+    """
+    found, lacking = [], []
+    for run in runs.itertuples():
+        folder = root / str(run.folder)
+        if not (folder / POLICY).is_file():
+            lacking.append(str(run.folder))
+            continue
+        arrays = policy_arrays(folder / POLICY)
+        if not set(needed) <= arrays.keys():
+            lacking.append(str(run.folder))
+            continue
+        config = json.loads((folder / CONFIG).read_text())
+        if (flown := unsafe_sets.dynamics_of(config["task"])) != dynamics:
+            raise UserError(
+                f"{folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe set is "
+                f"that of {dynamics.other_turns[0]:g}: compare it with that of its own task"
+            )
+        if NETWORK not in needed:
+            require_zeta(folder, config, arrays)
+        saved = Saved(
+            folder=folder,
+            zeta=arrays["zeta"].astype(float),
+            length_scale=float(arrays["length_scale"]),
+            eta=float(config["algorithm"]["hyperparameters"]["eta"]),
+        )
+        found.append((run, saved))
+    if lacking:
+        raise UserError(
+            f"no {POLICY} with {' and '.join(needed)} in {', '.join(lacking)} under "
+            f"{root}: take them out of aircraft.algorithms, or train them again"
+        )
+    return found

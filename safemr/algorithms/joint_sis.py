@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from safemr.algorithms import fac
+from safemr.learning.losses import Info
 from safemr.learning.replay import Batch
 
 VERSION = 1
@@ -117,7 +118,7 @@ class Agent(fac.Agent):
     def certificate_loss(self, batch: Batch, zeta: Tensor, multipliers: Tensor) -> Tensor:
         return certificate_loss(batch, multipliers, zeta, self.d_min, self.config)
 
-    def update_certificate(self, batch: Batch) -> fac.Info:
+    def update_certificate(self, batch: Batch) -> Info:
         """A projected gradient step on zeta every m_phi updates (Algorithm 1, last line)."""
         if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
             return {}

@@ -40,6 +40,7 @@ from torch import Tensor
 from safemr.algorithms import fac
 from safemr.certificates import energy
 from safemr.learning.contract import generator
+from safemr.learning.losses import Info
 from safemr.learning.networks import StackedMLP
 from safemr.learning.policies import network_arrays
 from safemr.learning.replay import Batch
@@ -159,7 +160,7 @@ class Agent(fac.Agent):
         g = energy.constraint(*self.energies(batch), self.config.eta)
         return g.clamp_min(self.config.constraint_floor)
 
-    def update_certificate(self, batch: Batch) -> fac.Info:
+    def update_certificate(self, batch: Batch) -> Info:
         """A step of Adam on theta every m_phi updates (Algorithm 1, last line)."""
         if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
             return {}

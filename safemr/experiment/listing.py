@@ -95,7 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    from safemr.cli import reported_errors
+    from safemr.errors import reported_errors
 
     with reported_errors():
         raise SystemExit(main())

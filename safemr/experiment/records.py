@@ -21,8 +21,6 @@ import math
 import os
 import re
 import shlex
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,17 +29,13 @@ import numpy as np
 
 from safemr import files
 from safemr.errors import UserError
+from safemr.files import POLICY
 
 if TYPE_CHECKING:
     import pandas as pd
 
 SCHEMA = 1
-CONFIG, PROGRESS, POLICY, PROVENANCE = (
-    "config.json",
-    "progress.csv",
-    "policy.npz",
-    "provenance.json",
-)
+CONFIG, PROGRESS, PROVENANCE = "config.json", "progress.csv", "provenance.json"
 REQUIRED_FILES = (CONFIG, PROGRESS, PROVENANCE)
 REQUIRED_METRICS = ("eval_return", "eval_cost", "eval_zero_violation_share")
 CONFIG_KEYS = {"schema", "task", "algorithm", "seed", "steps", "evaluation", "log_every"}
@@ -160,20 +154,6 @@ def write_record(
     }
     text = json.dumps(closing, sort_keys=True, indent=1, allow_nan=False) + "\n"
     files.write(folder / PROVENANCE, text.encode())
-
-
-def policy_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused.
-
-    Raises UserError where there is no such file, or none that can be read.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such policy; train the run first") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is not a readable policy file: {error}") from error
 
 
 def verify_record(folder: Path) -> None:

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from safemr.algorithms import fac
 from safemr.learning import numba_kernels
+from safemr.learning.losses import Info
 from safemr.learning.networks import ACTIVATIONS, StackedMLP
 from safemr.learning.replay import Batch
-from safemr.learning.torch_steps import AutogradSteps
+from safemr.learning.torch_steps import TorchSteps
 
 
 def network(stack: StackedMLP) -> numba_kernels.Network:
@@ -42,8 +42,8 @@ def optimiser(adam: torch.optim.Adam) -> numba_kernels.Optimiser:
     return numba_kernels.Optimiser(*(state[name].detach().view(-1).numpy() for name in names))
 
 
-class FusedSteps(AutogradSteps):
-    """`AutogradSteps` without autograd: the same numbers up to the order of summation.
+class NumbaSteps(TorchSteps):
+    """`TorchSteps` without autograd: the same numbers up to the order of summation.
 
     Bound to the agent's tensors at the first step; an agent that exchanges them makes a new one.
     """
@@ -77,7 +77,7 @@ class FusedSteps(AutogradSteps):
     def follow_critics(self, rate: float) -> None:
         numba_kernels.polyak(self._networks["targets"], self._networks["critics"], rate)
 
-    def update_critics(self, batch: Batch, target: Tensor, measure: bool) -> fac.Info:
+    def update_critics(self, batch: Batch, target: Tensor, measure: bool) -> Info:
         loss, norm, mean = numba_kernels.critic_step(
             self._networks["critics"],
             self._optimisers["critics"],
@@ -88,7 +88,7 @@ class FusedSteps(AutogradSteps):
         )
         return {"critic_loss": loss, "critic_grad_norm": norm, "value_mean": mean}
 
-    def update_policy(self, batch: Batch, with_multiplier: bool, measure: bool) -> fac.Info:
+    def update_policy(self, batch: Batch, with_multiplier: bool, measure: bool) -> Info:
         agent, config = self.agent, self.agent.config
         inputs = agent.multiplier_inputs(batch.observations).contiguous().numpy()
         multipliers, constraint, raw, memory, loss, norm, log_density = numba_kernels.policy_step(
@@ -107,7 +107,7 @@ class FusedSteps(AutogradSteps):
             config.multiplier_cap,
             config.target_entropy,
         )
-        info: fac.Info = {}
+        info: Info = {}
         if measure:
             info = {
                 "policy_loss": loss,

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 
 from safemr.errors import UserError
-from safemr.experiment.records import POLICY, policy_arrays
+from safemr.files import POLICY, policy_arrays
 from safemr.learning.networks import ACTIVATIONS, StackedMLP
 from safemr.learning.observation import ObservationTransform
 

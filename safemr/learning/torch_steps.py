@@ -1,4 +1,4 @@
-"""The ``torch`` backend of the soft actor-critic family: steps on `fac`'s losses by autograd.
+"""The ``torch`` backend of the soft actor-critic family: steps by autograd.
 
 It is the definition of a step and works on every device; `safemr.learning.numba_steps` does the
 same without autograd and is tested against it.
@@ -6,18 +6,40 @@ same without autograd and is tested against it.
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import torch
 from torch import Tensor
 
-from safemr.algorithms import fac
-from safemr.learning.networks import squashed_gaussian
+from safemr.learning import losses
+from safemr.learning.networks import StackedMLP, squashed_gaussian
 from safemr.learning.replay import Batch
 
 
-class AutogradSteps:
-    """Sampling and gradient steps of a `fac.Agent`, written with differentiable operations."""
+class Stepped(Protocol):
+    """What steps need of an agent: its networks, optimisers and noise."""
 
-    def __init__(self, agent: fac.Agent) -> None:
+    config: Any
+    critics: StackedMLP
+    targets: StackedMLP
+    policy: StackedMLP
+    multiplier: StackedMLP
+    log_temperature: Tensor
+    optimisers: dict[str, torch.optim.Adam]
+
+    def noise(self, count: int) -> Tensor: ...
+
+    def multiplier_inputs(self, observations: Tensor) -> Tensor: ...
+
+    def multipliers(self, observations: Tensor) -> Tensor: ...
+
+    def constraint_of(self, observations: Tensor, actions: Tensor) -> Tensor: ...
+
+
+class TorchSteps:
+    """Sampling and gradient steps of an agent, written with differentiable operations."""
+
+    def __init__(self, agent: Stepped) -> None:
         self.agent = agent
 
     @torch.no_grad()
@@ -35,11 +57,11 @@ class AutogradSteps:
         """Polyak averaging of the target critics."""
         self.agent.targets.follow(self.agent.critics, rate)
 
-    def update_critics(self, batch: Batch, target: Tensor, measure: bool) -> fac.Info:
-        """A step on `fac.critic_loss`; target [3, B]."""
+    def update_critics(self, batch: Batch, target: Tensor, measure: bool) -> losses.Info:
+        """A step on `losses.critic_loss`; target [3, B]."""
         critics = self.agent.critics
         values = critics(torch.cat((batch.observations, batch.actions), 1))[..., 0]
-        loss = fac.critic_loss(values, target)
+        loss = losses.critic_loss(values, target)
         gradient = self._step("critics", critics.parameters, loss)
         if not measure:
             return {}
@@ -49,18 +71,19 @@ class AutogradSteps:
             "value_mean": values[0].detach().mean(),
         }
 
-    def update_policy(self, batch: Batch, with_multiplier: bool, measure: bool) -> fac.Info:
-        """Steps on `fac.policy_loss`, `fac.temperature_loss` and, maybe, `fac.multiplier_loss`."""
+    def update_policy(self, batch: Batch, with_multiplier: bool, measure: bool) -> losses.Info:
+        """Steps on `losses.policy_loss`, `losses.temperature_loss` and, maybe,
+        `losses.multiplier_loss`."""
         agent, config, observations = self.agent, self.agent.config, batch.observations
         output = agent.policy(observations)[0]
         action, log_density = squashed_gaussian(output, agent.noise(len(output)))
         values = agent.critics.frozen(torch.cat((observations, action), 1))[..., 0]
-        constraint = values[fac.REWARD_CRITICS] / config.constraint_scale
+        constraint = values[losses.REWARD_CRITICS] / config.constraint_scale
         with torch.set_grad_enabled(with_multiplier):
             multipliers = agent.multipliers(observations)
-        loss = fac.policy_loss(
+        loss = losses.policy_loss(
             log_density,
-            values[: fac.REWARD_CRITICS],
+            values[: losses.REWARD_CRITICS],
             constraint,
             multipliers.detach(),
             agent.log_temperature.detach().exp(),
@@ -69,9 +92,9 @@ class AutogradSteps:
         self._step(
             "temperature",
             agent.log_temperature,
-            fac.temperature_loss(agent.log_temperature, log_density, config.target_entropy),
+            losses.temperature_loss(agent.log_temperature, log_density, config.target_entropy),
         )
-        info: fac.Info = {}
+        info: losses.Info = {}
         if measure:
             info = {
                 "policy_loss": loss.detach(),
@@ -84,7 +107,7 @@ class AutogradSteps:
         if with_multiplier:
             if config.multiplier_action == "replay":
                 constraint = agent.constraint_of(observations, batch.actions)
-            dual = fac.multiplier_loss(multipliers, constraint)
+            dual = losses.multiplier_loss(multipliers, constraint)
             gradient = self._step(
                 "multiplier", agent.multiplier.parameters, dual, config.multiplier_grad_norm
             )

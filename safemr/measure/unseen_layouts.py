@@ -11,16 +11,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-from scipy import stats
 
-from safemr import paper
 from safemr.experiment import records
-from safemr.learning import evaluation
+from safemr.measure import evaluate
 from safemr.measure.controllers import SCORE_COLUMNS
 from safemr.measure.store import Measurements
-from safemr.report import statistics
-from safemr.report.statistics import Estimate
-from safemr.report.tables import ABSENT, FEW, SafetyRule, Table, entries, plus_minus
 
 
 def measured_scores(
@@ -36,81 +31,9 @@ def measured_scores(
         if not (folder / records.POLICY).exists():
             print(f"no policy in {folder}")
             continue
-        found = evaluation.measured(measurements, folder, episodes=episodes, seed=seed)
+        found = evaluate.measured(measurements, folder, episodes=episodes, seed=seed)
         config = json.loads((folder / records.CONFIG).read_text(encoding="utf-8"))
         provenance = json.loads((folder / records.PROVENANCE).read_text(encoding="utf-8"))
         name = (config["task"]["name"], provenance["variant"], config["seed"])
         rows += [(*name, f"eval_{metric}", value) for metric, value in found.items()]
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)
-
-
-def table(
-    flown: pd.DataFrame,
-    scores: pd.DataFrame,
-    *,
-    episodes: int,
-    rule: SafetyRule | None = None,
-    layouts: int = 10,
-) -> Table:
-    """A row an algorithm and task: return, its change against the final evaluations, how far it is
-    behind SafeMR's, violations.
-
-    flown: `measured_scores`. scores: `statistics.final_scores`, of evaluations on ``layouts``. The
-    upper end is Clopper and Pearson's one-sided 95% bound on the probability that an episode has a
-    violation, as if all episodes of all seeds were independent.
-    """
-    rule = rule or SafetyRule()
-    rows = []
-    for task, variant in entries(flown, None):
-        ours = {
-            metric: statistics.scores_of(flown, task, variant, metric)
-            for metric in ("eval_return", rule.cost, rule.clean)
-        }
-        before = statistics.scores_of(scores, task, variant, "eval_return")
-        mean = statistics.mean_interval(ours["eval_return"])
-        method = statistics.scores_of(flown, task, paper.METHOD, "eval_return")
-        gap = statistics.difference_interval(method, ours["eval_return"])
-        if variant == paper.METHOD:
-            gap = Estimate(float("nan"), float("nan"), float("nan"), 0)
-        steps = statistics.score_interval(flown, task, variant, rule.cost)
-        total = episodes * len(ours[rule.clean])
-        dirty = round(float((episodes * (1 - ours[rule.clean])).sum()))
-        bound = 1.0 if dirty == total else float(stats.beta.ppf(0.95, dirty + 1, total - dirty))
-        rows.append(
-            {
-                "task": task, "variant": variant, "seeds": mean.size,
-                "safe": rule.is_safe(flown, task, variant),
-                "return": mean.mean, "return_low": mean.low, "return_high": mean.high,
-                "change": mean.mean - before.mean() if len(before) else float("nan"),
-                "behind": gap.mean, "behind_low": gap.low, "behind_high": gap.high,
-                "violating_steps": steps.mean, "steps_low": steps.low, "steps_high": steps.high,
-                "violating_episodes": dirty, "episodes": total, "upper_bound": bound,
-            }
-        )  # fmt: skip
-    data = pd.DataFrame(rows)
-    display = pd.DataFrame(
-        [
-            [
-                row["task"], row["variant"], str(row["seeds"]), "yes" if row["safe"] else "no",
-                plus_minus(row["return"], row["return_low"], row["return_high"], 2),
-                ABSENT if pd.isna(row["change"]) else f"{row['change']:+.2f}",
-                ABSENT if pd.isna(row["behind"])
-                else plus_minus(row["behind"], row["behind_low"], row["behind_high"], 2),
-                plus_minus(row["violating_steps"], row["steps_low"], row["steps_high"], 2),
-                f"{row['violating_episodes']} of {row['episodes']}", f"{row['upper_bound']:.1%}",
-            ]
-            for row in rows
-        ],
-        columns=["task", "algorithm", "seeds", "safe", "return", "against the final evaluations",
-                 f"{paper.METHOD} minus it",
-                 "violating steps", "episodes with a violation", "at most"],
-    )  # fmt: skip
-    caption = (
-        f"Final policies on {episodes} layouts that no run was evaluated on, the same for all: "
-        "mean over seeds ± half width of the 95% t interval; what it changes against the final "
-        f"evaluations on {layouts} layouts; SafeMR's return minus this one, with Welch's interval; "
-        f"[the ends] of an interval that is cut off at 0. {FEW} At "
-        "most: one-sided 95% bound on the probability that an episode has a violation, as if all "
-        f"episodes were independent. {str(rule).capitalize()}; here applied to these episodes."
-    )
-    return Table("unseen_layouts", caption, data, display)

@@ -60,7 +60,7 @@ def _read(path: Path, otherwise: str) -> str:
 
 
 if __name__ == "__main__":
-    from safemr.cli import reported_errors
+    from safemr.errors import reported_errors
 
     with reported_errors():
         sys.exit(main())

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.experiment import records
 from safemr.report import statistics
 

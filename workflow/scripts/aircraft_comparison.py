@@ -5,8 +5,9 @@ from pathlib import Path
 import pandas as pd
 
 from safemr.aircraft import scoring
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.experiment import records
+from safemr.report import aircraft as tables
 from safemr.report import statistics
 from safemr.tasks import name_of
 
@@ -21,4 +22,4 @@ with reported_errors():
 comparison.to_csv(output.comparison, index=False)
 scoring.as_scores(comparison, name_of(params.task)).to_csv(output.scores, index=False)
 missing = statistics.missing_runs(expected, runs)
-scoring.comparison_table(comparison, missing, params.task).write(Path(output.markdown).parent)
+tables.comparison_table(comparison, missing, params.task).write(Path(output.markdown).parent)

@@ -7,8 +7,8 @@ import pandas as pd
 
 from safemr import paper
 from safemr.aircraft import reachability, scoring
-from safemr.cli import reported_errors
 from safemr.conventions import COVERS
+from safemr.errors import reported_errors
 from safemr.measure.store import Measurements
 from safemr.report.figures import aircraft, style
 

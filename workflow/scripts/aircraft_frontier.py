@@ -1,7 +1,7 @@
 """What the best energy functions of the paper's family can do against the true unsafe set."""
 
 from safemr.aircraft.scoring import TrueSets, measured_frontier
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.measure.store import Measurements
 
 params = snakemake.params

@@ -8,11 +8,12 @@ import torch
 from safemr import paper
 from safemr.aircraft import neural, reachability
 from safemr.aircraft.scoring import TrueSets
-from safemr.cli import reported_errors
 from safemr.conventions import COVERS
+from safemr.errors import reported_errors
 from safemr.experiment import records
 from safemr.measure.store import Measurements
 from safemr.report import statistics
+from safemr.report.aircraft import neural_table
 from safemr.report.figures import aircraft, style
 
 torch.set_num_threads(1)
@@ -33,7 +34,7 @@ with reported_errors():
     )
 comparison.to_csv(output.comparison, index=False)
 missing = statistics.missing_runs(expected, runs)
-neural.comparison_table(comparison, missing).write(Path(output.markdown).parent)
+neural_table(comparison, missing).write(Path(output.markdown).parent)
 # One seed of each in the slice, every seed on the trade-off, beside the learners of zeta.
 learned = others["variant"].isin(paper.LEARNERS)
 beside = others[learned | (others["kind"] == "certificate")]

@@ -5,9 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from safemr import paper
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.measure import certify
 from safemr.measure.store import Measurements
+from safemr.report import certificates
 from safemr.report.figures import style
 from safemr.tasks import name_of
 
@@ -31,8 +32,8 @@ with reported_errors():
     # The map is that of the last one.
     chosen.sort(key=lambda job: job[0].name.partition(" (")[0] == paper.METHOD)
     mapped = certify.measured_margins(measurements, *chosen[-1])
-    figure = certify.picture([certificate for certificate, _ in chosen], *mapped)
-table = certify.certificate_table(rows)
+    figure = certificates.picture([certificate for certificate, _ in chosen], *mapped)
+table = certificates.certificate_table(rows)
 lacking = [f"{c.name} on {name_of(task)}" for c, task in learned.values() if c.policy is None]
 if lacking:
     note = f"No policy.npz, parameters from progress.csv: {'; '.join(lacking)}."

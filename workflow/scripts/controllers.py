@@ -1,6 +1,6 @@
 """Scores of the scripted controllers, in the same form as those of the learned policies."""
 
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.measure import controllers
 from safemr.measure.store import Measurements
 

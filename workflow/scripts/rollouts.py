@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from safemr import files
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.measure import trajectories
 from safemr.measure.certify import certificate_of_record
 from safemr.measure.store import Measurements

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from safemr.cli import reported_errors
+from safemr.errors import reported_errors
 from safemr.measure import unseen_layouts
 from safemr.measure.store import Measurements
 

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.measure import unseen_layouts
-from safemr.report import differences, tables
+from safemr.report import differences, tables, unseen_layouts
 
 params = snakemake.params
 flown = pd.concat([pd.read_csv(path) for path in snakemake.input.flown], ignore_index=True)

@@ -6,8 +6,8 @@ metres: ``truth`` is the value V (unsafe where <= 0), the others are unsafe wher
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -18,6 +18,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.ticker import FixedLocator, MultipleLocator, NullLocator
 from numpy.typing import NDArray
 
+from safemr.aircraft.slices import Slice
 from safemr.report.figures import style
 
 Array = NDArray[np.float64]
@@ -27,17 +28,6 @@ _HANDCRAFTED, _HANDCRAFTED_LABEL = "FAC-phih", r"handcrafted $\phi_h$"
 # The left half of an aircraft's outline, nose at the right, one unit long.
 _OUTLINE_X = (0.5, 0.42, 0.12, -0.12, -0.22, -0.1, -0.34, -0.43, -0.5, -0.46)
 _OUTLINE_Y = (0.0, 0.05, 0.06, 0.46, 0.46, 0.06, 0.04, 0.18, 0.18, 0.0)
-
-
-@dataclass(frozen=True)
-class Slice:
-    """Everything at one heading difference psi [rad]; arrays [X, Y]."""
-
-    psi: float
-    truth: Array
-    handcrafted: Array
-    learned: Mapping[str, Sequence[Array]]  # variant -> one array a seed
-    adversarial: Array | None = None  # V against adversarial traffic
 
 
 def draw_aircraft(

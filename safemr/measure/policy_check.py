@@ -1,0 +1,79 @@
+"""How often a trained policy breaks its certificate's constraint, and how often needlessly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safemr.certificates.energy import constraint, energy, largest
+from safemr.certificates.falsification import make_simulator, simulated_grid
+from safemr.learning.evaluation import Acts
+from safemr.paper import Zeta
+from safemr.tasks import Task
+
+
+@dataclass(frozen=True)
+class PolicyCheck:
+    """How often a policy violated Eq. cstr0, and how often it need not have."""
+
+    steps: int
+    violating: int  # steps with g >= 0
+    examined: int  # violating steps whose action grid was searched
+    avoidable: int  # of these: a safe action existed
+
+    @property
+    def violating_share(self) -> float:
+        return self.violating / self.steps
+
+    @property
+    def avoidable_share(self) -> float:
+        """Share of all steps at which a violating action was picked although a safe one existed."""
+        return self.violating_share * self.avoidable / self.examined if self.examined else 0.0
+
+
+def check_policy(
+    policy: Acts,
+    task: Task,
+    zeta: Zeta,
+    *,
+    eta: float = 0.0,
+    num_envs: int = 32,
+    steps: int = 1000,
+    seed: int = 0,
+    limit: int = 256,
+) -> PolicyCheck:
+    """Run the deterministic policy and search violating steps for a safe action in the simulator.
+
+    At most `limit` of the violating steps, a seeded sample, are searched.
+    """
+    envs = make_simulator(task, num_envs)
+    observations, infos = envs.reset(seed=seed)
+    gyro = envs.observation_layout["gyro"]
+    found: list[tuple[dict[str, NDArray[Any]], float, float]] = []
+    for _ in range(steps):
+        before = envs.get_state()["worlds"]
+        phi = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        turn_rates = observations[:, gyro][:, 2]
+        observations, _, terminated, truncated, infos = envs.step(policy.act(observations))
+        reached = {name: infos[name].copy() for name in ("d", "d_dot")}
+        done = terminated | truncated
+        for name in reached if done.any() else ():
+            reached[name][done] = infos["final_info"][name][done]
+        phi_next = largest(energy(reached["d"], reached["d_dot"], envs.d_min, *zeta))
+        for index in np.flatnonzero(constraint(phi, phi_next, eta) >= 0):
+            world = {name: array[index] for name, array in before.items()}
+            found.append((world, turn_rates[index], phi[index]))
+    envs.close()
+    total = steps * num_envs
+    chosen = np.random.default_rng(seed).permutation(len(found))[:limit]
+    if not len(chosen):
+        return PolicyCheck(total, 0, 0, 0)
+    simulator = make_simulator(task)
+    worlds = {name: np.stack([found[i][0][name] for i in chosen]) for name in found[0][0]}
+    rates, phis = (np.array([found[i][column] for i in chosen]) for column in (1, 2))
+    g = simulated_grid(simulator, worlds, rates, phis, zeta, eta)[1]
+    simulator.close()
+    return PolicyCheck(total, len(found), len(chosen), int((g.min(1) < 0).sum()))

@@ -1,0 +1,238 @@
+"""``safemr certify``: the checks of certificates as table, picture and replayable examples."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from safemr.certificates import falsification
+from safemr.certificates.feasibility import BRAKINGS, CONVENTIONS
+from safemr.errors import UserError
+from safemr.experiment.planning import describe_task, installed
+from safemr.experiment.strict_yaml import assignment
+from safemr.paper import Zeta
+from safemr.report.tables import Table
+from safemr.tasks import Task, base_of, name_of, settings_of, task_settings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+from safemr.measure.certify import (
+    DEFAULT_STATES,
+    DEFAULT_TASK,
+    Certificate,
+    certificate_of_record,
+    certify,
+    contact_distance,
+    example_titles,
+    margin_column,
+    margin_map,
+    paper_certificates,
+)
+
+SAME_MARGIN = 1e-6  # processors differ by round-off
+
+
+def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """The rows of `certify` as a `Table`."""
+    data = pd.DataFrame(rows)
+    verdicts = {
+        f"C {convention}, {braking}": [
+            f"{'holds' if margin >= 0 else 'fails'} ({margin:+.2f})"
+            for margin in data[margin_column(convention, braking)]
+        ]
+        for convention in CONVENTIONS
+        for braking in BRAKINGS
+    }
+    display = pd.DataFrame(
+        {
+            "certificate": data["certificate"],
+            "task": data["task"],
+            "[sigma, k, n]": [
+                f"[{r.sigma:.3f}, {r.k:.3f}, {r.n:.3f}]" for r in data.itertuples()
+            ],
+            **verdicts,
+            "infeasible": [_share(share, data["states"][i])
+                           for i, share in enumerate(data["infeasible_share"])],
+            "leaking": [f"{100 * share:.3f}%" for share in data["leak_share"]],
+            "least g at the worst state": [f"{margin:+.4f}" for margin in data["worst_margin"]],
+            "simulator agrees": data["simulator_agrees"],
+        }
+    )  # fmt: skip
+    if "policy_steps" in data:
+        for name, heading in (("violating", "policy violates"), ("avoidable", "avoidably")):
+            shares = data[f"policy_{name}_share"]
+            display[heading] = ["–" if np.isnan(s) else f"{100 * s:.3f}%" for s in shares]
+    caption = (
+        "Certificates. Four verdicts of the analytic condition with the smallest margin in m/s^2 "
+        "(C inside: (sigma + d_min)^n, outside: sigma + d_min^n; deceleration with the robot "
+        "aligned, or from drag alone); share of searched states without a safe action "
+        "(infeasible); of states with phi <= 0 that every action takes out of the safe set "
+        "(leaking); and the worst best margin found, positive where no action is safe. Shares are "
+        "uniform over distance, bearing, course, speed and turn rate; not every such state can be "
+        "driven to."
+    )
+    return Table("certificates", caption, data, display)
+
+
+def picture(certificates: Sequence[Certificate], margins: pd.DataFrame, d_min: float) -> Figure:
+    """The analytic condition of certificates of one task, and ``margins`` of the last of them."""
+    from safemr.report.figures import certificate as drawing
+
+    zetas = {certificate.name: certificate.zeta for certificate in certificates}
+    return drawing.certificate_check(zetas, d_min, margins, certificates[-1].name)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`safemr certify`; prints the table and, with --out, writes table, picture and examples."""
+    options = _parser().parse_args(arguments)
+    if options.replay is not None:
+        return _replay(options)
+    jobs = _jobs(options)
+    rows, searches = [], []
+    for certificate, task in jobs:
+        print(f"certifying {certificate.name} on {name_of(task)} ...", file=sys.stderr)
+        row, search = certify(certificate, task, states=options.states, seed=options.seed)
+        rows.append(row)
+        searches.append(search)
+    table = certificate_table(rows)
+    print(table.markdown())
+    for row, search in zip(rows, searches, strict=True):
+        print(f"worst state of {row['certificate']}: {json.dumps(search.example())}")
+    if options.out is not None:
+        _write(options.out, table, jobs, searches)
+    return 0
+
+
+def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, Task]]:
+    """What the command line asks for: (certificate, task) each."""
+    given = (options.sigma, options.k, options.n)
+    if options.record:
+        if any(value is not None for value in given):
+            raise UserError("give either --record or --sigma, --k and --n, not both")
+        for name in ("task", "set", "eta"):
+            if getattr(options, name):
+                raise UserError(f"--{name}: a record says its own; leave it out beside --record")
+        return [certificate_of_record(Path(folder)) for folder in options.record]
+    if all(value is None for value in given):
+        named = paper_certificates()
+    elif any(value is None for value in given):
+        raise UserError("--sigma, --k and --n belong together: give all three")
+    else:
+        if min(options.sigma, options.k) < 0 or options.n <= 0:
+            raise UserError("sigma and k must not be negative and n must be positive")
+        named = [Certificate(options.name, Zeta(*given))]
+    task = _task(options.task or DEFAULT_TASK, options.set)
+    return [(Certificate(c.name, c.zeta, options.eta), task) for c in named]
+
+
+def _task(registered: str, assignments: Sequence[str]) -> Task:
+    """A registered task; with other settings (``task.NAME=VALUE``) under a name that says them."""
+    settings = dict(map(assignment, assignments))
+    for name in settings:
+        if not name.startswith("task."):
+            raise UserError(
+                f"--set {name}: only the environment has settings here: task.NAME=VALUE"
+            )
+    settings = {name.removeprefix("task."): value for name, value in settings.items()}
+    entry = describe_task(registered, settings, "--task")
+    changed = task_settings(settings)
+    return {**entry, "name": _named(registered, changed), "base": registered} if changed else entry
+
+
+def _named(registered: str, changed: Mapping[str, Any]) -> str:
+    """A task and its settings in words."""
+    said = ", ".join(f"{name}={value}" for name, value in sorted(changed.items()))
+    return f"{registered} with {said}" if said else registered
+
+
+def _write(
+    folder: Path,
+    table: Table,
+    jobs: Sequence[tuple[Certificate, Task]],
+    searches: Sequence[falsification.Falsification],
+) -> None:
+    from safemr.report.figures import style
+
+    table.write(folder)
+    found = [search.example() for search in searches]
+    examples = dict(zip(example_titles(jobs), found, strict=True))
+    text = json.dumps(examples, indent=1, sort_keys=True) + "\n"
+    (folder / "examples.json").write_text(text, encoding="utf-8")
+    task = jobs[0][1]
+    pictured = [job[0] for job in jobs if job[1] == task]
+    margins = margin_map(task, pictured[-1].zeta, eta=pictured[-1].eta)
+    style.save(picture(pictured, margins, contact_distance(task)), folder / "certificates")
+
+
+def _replay(options: argparse.Namespace) -> int:
+    """Exit status 1 where an example does not come out as its file says."""
+    path = options.replay
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        examples = content if "state" not in content else {path.stem: content}
+        stated = {name: float(example["margin"]) for name, example in examples.items()}
+        for name, example in examples.items():
+            _check_task(options, f"{path}: {name}", installed(falsification.task_of(example)))
+        results = {name: falsification.replay(example) for name, example in examples.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} holds no example written by --out ({error!r})") from error
+    differing = 0
+    for name, (actions, g) in results.items():
+        best = int(g.argmin())
+        verdict = "no action is safe" if g[best] >= 0 else "a safe action exists"
+        a0, a1 = actions[best]
+        print(
+            f"{name}: {len(g)} actions, least g = {g[best]:+.6f} at ({a0:.3f}, {a1:.3f}): {verdict}"
+        )
+        if abs(g[best] - stated[name]) > SAME_MARGIN:
+            differing += 1
+            print(f"{name}: the file says {stated[name]:+.6f}: another task or version made it")
+    return 1 if differing else 0
+
+
+def _check_task(options: argparse.Namespace, what: str, task: Task) -> None:
+    """Raises UserError where ``--task`` or ``--set`` ask for another task than an example's."""
+    asked = _task(options.task or base_of(task), options.set)
+    said, wanted = ((base_of(entry), task_settings(settings_of(entry))) for entry in (task, asked))
+    if (options.task or options.set) and said != wanted:
+        raise UserError(f"{what} is an example of {_named(*said)}, not of {_named(*wanted)}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="safemr certify", description=__doc__)
+    parser.add_argument("--sigma", type=float, help="parameters in metres and seconds")
+    parser.add_argument("--k", type=float)
+    parser.add_argument("--n", type=float)
+    parser.add_argument("--eta", type=float, default=0.0, help="eta_D of the constraint")
+    parser.add_argument("--name", default="given", help="name of --sigma, --k, --n in the table")
+    parser.add_argument("--task", help=f"default {DEFAULT_TASK}")
+    parser.add_argument("--set", action="append", default=[], metavar="task.NAME=VALUE",
+                        help="a setting of the environment")  # fmt: skip
+    parser.add_argument("--record", action="append", default=[], metavar="FOLDER",
+                        help="a run record: its certificate, and its policy too")  # fmt: skip
+    parser.add_argument("--states", type=int, default=DEFAULT_STATES,
+                        help="states searched, a power of two")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write table, picture, examples")
+    parser.add_argument("--replay", type=Path, metavar="FILE", help="replay examples.json")
+    return parser
+
+
+def _share(share: float, count: int) -> str:
+    """A share in per cent; none found in `count` states is not zero."""
+    return f"{100 * share:.3f}%" if share else f"none of {count}"
+
+
+if __name__ == "__main__":
+    from safemr.errors import reported_errors
+
+    with reported_errors():
+        sys.exit(main())
