@@ -178,7 +178,7 @@ def test_table_prints_both_numbers_the_verdict_and_what_is_missing(
         )
     )
     assert (
-        f"SafeMR minus JointSIS, Welch's 95% interval: volume ratio {gap.mean:+.3f} ["
+        f"SafeMR minus JointSIS, Welch's 95% interval: volume ratio {gap.mean:+.3f};"
         in (table.notes[0])
     )
     assert gap.mean < 0
