@@ -184,7 +184,7 @@ def parse(raw: Any) -> Config:
         figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
         allow_missing=_flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
-        wandb_project=_name(wandb.get("project", "safemr"), "wandb.project"),
+        wandb_project=checked_name(wandb.get("project", "safemr"), "wandb.project"),
         cost_tolerance=_number(safe.get("cost_tolerance", 1.0), "safe.cost_tolerance", 0, math.inf),
         zero_violation_share=_number(
             safe.get("zero_violation_share", 0.95), "safe.zero_violation_share", 0, 1
@@ -213,18 +213,10 @@ def unknown(kind: str, name: Any, known: Iterable[str], where: str = "") -> User
 
 
 _TOP_LEVEL = (
-    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
-    *(
-        "unseen_layouts",
-        "sensitivity",
-        "aircraft",
-        "outside",
-        "results_root",
-        "figures_root",
-        "allow_missing",
-    ),
-    *("wandb", "safe"),
-)
+    "tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "unseen_layouts",
+    "task_overrides", "sensitivity", "aircraft", "outside", "results_root", "figures_root",
+    "allow_missing", "wandb", "safe",
+)  # fmt: skip
 
 
 class _Section:
@@ -257,7 +249,8 @@ def _mapping(value: Any, where: str) -> Mapping[str, Any]:
 
 def _labelled(value: Any, where: str) -> list[tuple[str, Any]]:
     items = [
-        (_name(key, f"a name in {where}"), item) for key, item in _mapping(value, where).items()
+        (checked_name(key, f"a name in {where}"), item)
+        for key, item in _mapping(value, where).items()
     ]
     _distinct([key.lower() for key, _ in items], where)
     return items
@@ -277,7 +270,8 @@ def _distinct(items: Sequence[Any], where: str) -> None:
             raise UserError(f"{where} names {show(item)} twice")
 
 
-def _name(value: Any, where: str) -> str:
+def checked_name(value: Any, where: str) -> str:
+    """A name as folders, figures and rules can hold it. Raises UserError for anything else."""
     if not isinstance(value, str) or not _NAME.fullmatch(value):
         raise UserError(
             f"{where} must consist of letters, digits and . _ + - (60 at most, not beginning with "
@@ -292,20 +286,13 @@ def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
     A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
     mapping of all names, those of registered tasks with nothing behind them.
     """
-    entries: list[tuple[Any, Any]] = []
-    if isinstance(value, Mapping):
-        entries += value.items()
-        if not entries:
-            raise UserError(f"{where} is empty")
-    else:
-        for item in _list(value, where):
-            if isinstance(item, Mapping) and len(item) != 1:
-                raise UserError(
-                    f"each of {where} must be a name or one NAME: {{base, settings}}, "
-                    f"not {show(item)}"
-                )
-            entries += item.items() if isinstance(item, Mapping) else [(item, None)]
-    names = [_name(name, f"each of {where}") for name, _ in entries]
+    parts = [value] if isinstance(value, Mapping) and value else _list(value, where)
+    entries = [
+        entry
+        for part in parts
+        for entry in (part.items() if isinstance(part, Mapping) and part else [(part, None)])
+    ]
+    names = [checked_name(name, f"each of {where}") for name, _ in entries]
     _distinct([name.lower() for name in names], where)
     return {
         name: _task_variant(entry, f"{where}.{name}")
@@ -318,18 +305,9 @@ def _task_variant(value: Any, where: str) -> TaskVariant | None:
         return None
     section = _Section(value, where, ("base", "settings"))
     return TaskVariant(
-        _name(section.required("base"), f"{where}.base"),
+        checked_name(section.required("base"), f"{where}.base"),
         _mapping(section.required("settings"), f"{where}.settings"),
     )
-
-
-def task_name(value: Any, where: str) -> str:
-    """A name that a task may have.
-
-    Raises:
-        UserError: for anything else.
-    """
-    return _name(value, where)
 
 
 def _integer(value: Any, where: str, low: int, high: int = LARGEST_COUNT) -> int:
@@ -375,7 +353,7 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
             hint = f"; did you mean it by {near[0]!r}?" if near else ""
             raise UserError(f"{where}.{label} lacks 'algorithm'{hint}")
         variants[label] = Variant(
-            _name(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
+            checked_name(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
         )
     if not variants:
         raise UserError(f"{where} is empty")
@@ -417,8 +395,8 @@ def _sensitivity(value: Any, seeds: Any) -> Sensitivity | None:
         points.append((a, b))
     _distinct(points, "sensitivity.points")
     return Sensitivity(
-        _name(section.required("task"), "sensitivity.task"),
-        _name(section.required("algorithm"), "sensitivity.algorithm"),
+        checked_name(section.required("task"), "sensitivity.task"),
+        checked_name(section.required("algorithm"), "sensitivity.algorithm"),
         tuple(points),
         _seeds(section.get("seeds", seeds), "sensitivity.seeds"),
     )
@@ -429,7 +407,7 @@ def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
         return None
     section = _Section(value, "aircraft", ("task", "algorithms", "seeds"))
     return Aircraft(
-        _name(section.get("task", "Aircraft"), "aircraft.task"),
+        checked_name(section.get("task", "Aircraft"), "aircraft.task"),
         _variants(section.required("algorithms"), "aircraft.algorithms"),
         _seeds(section.get("seeds", seeds), "aircraft.seeds"),
     )
@@ -438,7 +416,7 @@ def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
 def _outside(value: Any, where: str) -> Outside:
     section = _Section(value, where, ("algorithm", "version", "steps", "hyperparameters"))
     return Outside(
-        _name(section.required("algorithm"), f"{where}.algorithm"),
+        checked_name(section.required("algorithm"), f"{where}.algorithm"),
         _integer(section.get("version", 1), f"{where}.version", 1),
         _integer(section.required("steps"), f"{where}.steps", 1),
         _mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),

@@ -19,7 +19,7 @@ from typing import Any, TextIO
 
 from safemr import records, runs
 from safemr.checkpoints import CHECKPOINT, RunSession
-from safemr.config import WANDB_MODES, task_name
+from safemr.config import WANDB_MODES, checked_name
 from safemr.errors import UserError, tell
 from safemr.strict_yaml import typed
 from safemr.tasks import make_envs
@@ -208,7 +208,7 @@ def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         task = runs.describe_task(arguments.task, settings, "--task")
         runs.check_name(task, "--set", "give it with --task-name")
         return task
-    name = task_name(arguments.task_name, "--task-name")
+    name = checked_name(arguments.task_name, "--task-name")
     runs.describe_task(arguments.task, settings, "--task")
     return runs.describe_task(name, settings, "--task-name", base=arguments.task)
 
