@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from safemr import records, runs
-from safemr.config import WANDB_MODES, task_name
+from safemr.config import WANDB_MODES
 from safemr.conventions import EVALUATION_SEED
 from safemr.errors import UserError, tell
+from safemr.sections import checked_name
 from safemr.signals import StoppedError, StopSignals
 from safemr.strict_yaml import assignment
 from safemr.tasks import make_envs
@@ -215,7 +216,7 @@ def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         task = runs.describe_task(arguments.task, settings, "--task")
         runs.check_name(task, "--set", "give it with --task-name")
         return task
-    name = task_name(arguments.task_name, "--task-name")
+    name = checked_name(arguments.task_name, "--task-name")
     runs.describe_task(arguments.task, settings, "--task")
     return runs.describe_task(name, settings, "--task-name", base=arguments.task)
 
