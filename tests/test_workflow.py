@@ -25,6 +25,7 @@ from safemr.locks import ProcessLock
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("Snakefile", "config", "envs", "safemr", "workflow")
+TASK = "Pillars-0.15-Goal"
 GRID: dict[str, Any] = {
     "tasks": ["Pillars-0.15-Goal"],
     "algorithms": {
@@ -92,7 +93,7 @@ class Checkout:
         table = printed.partition("Job stats:")[2].partition("total")[0]
         return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M)}
 
-    def fill_in_records(self) -> None:
+    def fill_in_records(self, root: Path | None = None) -> None:
         """A record for every run of the plan, without training."""
         for run in self.plan().runs:
             rows = [
@@ -103,7 +104,7 @@ class Checkout:
                 }
                 for step in (run.config["steps"] // 2, run.config["steps"])
             ]
-            folder = self.folder / "results" / run.path
+            folder = (root or self.folder / "results") / run.path
             records.write_record(folder, run.config, run.variant, rows, {"cpu_s": 60.0})
 
 
@@ -131,7 +132,8 @@ def test_a_fresh_clone_trains_only_what_changed(checkout: Checkout) -> None:
         os.utime(path, (generator.uniform(1e9, 1.7e9),) * 2)
     assert "train" not in checkout.scheduled()
 
-    changed = {**GRID["algorithms"], "SafeMR": {"algorithm": "safemr", "gamma": 0.98}}
+    other = {**GRID["algorithms"]["SafeMR"], "gamma": 0.98}
+    changed = {**GRID["algorithms"], "SafeMR": other}
     checkout.configure(algorithms=changed)
     assert checkout.scheduled()["train"] == 2
     checkout.configure()
@@ -220,7 +222,7 @@ def test_adding_a_baseline_is_one_file_and_one_line(checkout: Checkout) -> None:
     algorithms = checkout.folder / "safemr/algorithms"
     (algorithms / "my_baseline.py").write_text((algorithms / "fac.py").read_text())
     path = checkout.folder / "config/config.yaml"
-    line = "algorithms:\n  Mine: {algorithm: my_baseline, gamma: 0.97}\n"
+    line = "algorithms:\n  Mine: {algorithm: my_baseline, gamma: 0.97, start_steps: 200}\n"
     path.write_text(path.read_text().replace("algorithms:\n", line))
     jobs = checkout.scheduled()
     assert jobs["train"] == len(GRID["tasks"]) * len(GRID["seeds"])
@@ -400,6 +402,26 @@ def test_two_snakemakes_at_once_train_every_run_once(checkout: Checkout) -> None
         folder = checkout.folder / "results" / run.path
         records.verify_record(folder)
         assert len(json.loads((folder / "provenance.json").read_text())["attempts"]) == 1
+
+
+def test_roots_outside_the_repository(tmp_path: Path) -> None:
+    """Records, lock, logs and tables lie under ../..., figures under an absolute path."""
+    (tmp_path / "here").mkdir()
+    checkout = Checkout(tmp_path / "here")
+    checkout.configure(
+        results_root="../away/results", figures_root=f"{tmp_path}/drawn", seeds=[100], tasks=[TASK]
+    )
+    away = tmp_path / "away/results"
+    assert checkout.scheduled()["train"] == 2
+    checkout.fill_in_records(away)
+    assert "train" not in checkout.scheduled()
+    checkout.snakemake("../away/results/tables/results.md", f"{tmp_path}/drawn/training_curves.png")
+    assert "SafeMR" in (away / "tables/results.md").read_text()
+    assert (tmp_path / "drawn/training_curves.png").stat().st_size > 1000
+    assert (away / ".work/snakemake.lock").exists()
+    assert (away / "logs/aggregate.log").exists()
+    assert not (checkout.folder / "results").exists()
+    assert not (checkout.folder / "paper_figures").exists()
 
 
 @pytest.mark.slow
