@@ -44,7 +44,7 @@ BESIDE: dict[str, dict[str, Any]] = {
     "backtrack_iterations": {"target_kl": 1.0},
     "target_kl": {"policy_lr": 0.01},  # PPO has to reach the bound
     "kl_stop": {"policy_lr": 0.01},
-    "certificate_derivative": {"sigma": 1.0},  # the point has to enter the unsafe set
+    "certificate_derivative": {"sigma": 0.9, "a": 0.1},  # the point has to enter the unsafe set
 }
 # No loss can raise sigma, and k and n move little: these bounds of the box refuse a start beyond.
 BOUNDS_OF_THE_START = {"sigma_max": 0.2, "k_max": 0.2, "n_min": 3.0, "n_max": 0.2}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import importlib.util
 import os
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -19,6 +21,8 @@ from toy import ToyEnvs
 
 from safemr.algorithms import safemr
 from safemr.learning.evaluation import evaluate
+from safemr.learning.networks import squashed_gaussian
+from safemr.learning.observation import ObservationTransform
 from safemr.learning.replay import Replay
 from safemr.tasks import make_envs
 
@@ -26,10 +30,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRAM = ROOT / "examples/safemr_minimal.py"
 
 # The operations are the same, but the library multiplies stacks of matrices and steps on one flat
-# vector, so sums round differently: 1e-7 of a network's norm, measured over 300 updates. Adam may
-# make a whole step of a gradient that is only rounding (a unit that is all but dead), which is why
-# more is allowed. Runs move the networks by more than 1000 times this.
-TOLERANCE = 1e-5
+# vector, so sums round differently: in float32 by 1e-7 of a network's norm (measured). That lasts
+# until a unit is within rounding of its kink for some sample, or two critics of a tie: then that
+# sample's gradient takes the other branch. With 64 units this happens about once in 100 updates,
+# and makes a difference of 1e-5.
+ROUNDING, BRANCHES = 1e-6, 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +46,20 @@ def minimal() -> ModuleType:
     return module
 
 
+def library_config(config: Any, **settings: Any) -> safemr.Config:
+    """The library's for the example's."""
+    settings = dataclasses.asdict(config) | settings
+    for field, end in (("zeta", ""), ("low", "_min"), ("high", "_max")):
+        names = [name + end for name in ("sigma", "k", "n")]
+        settings |= dict(zip(names, settings.pop(field), strict=True))
+    return safemr.Config(**settings)
+
+
 class Library:
     """A trainer of the torch backend whose time steps are remembered until they are played back."""
 
-    def __init__(self, settings: dict[str, Any], envs: Any, seed: int, total_steps: int) -> None:
+    def __init__(self, config: safemr.Config, envs: Any, seed: int, total_steps: int) -> None:
         self.envs, self.tape, self.losses = envs, [], {}
-        config = safemr.Config(backend="torch", **settings)
         self.trainer = safemr.Trainer(config, lambda _: self, seed, total_steps)
         agent_update = self.trainer.agent.update
 
@@ -78,10 +91,10 @@ class Library:
             network = getattr(agent, name)
             layers = network.shape.layers(network.parameters.detach())
             found[name] = [
-                array[member].squeeze(0) if array.shape[1] == 1 and kind else array[member]
+                array.clone()
                 for member in range(network.shape.count)
-                for layer in layers
-                for kind, array in enumerate(layer)
+                for weight, bias in layers
+                for array in (weight[member], bias[member, 0])
             ]
         return found
 
@@ -109,7 +122,7 @@ class Playback:
         trainer = self.library.trainer
         trainer.advance(trainer.step + 1)
         expected, result = self.library.tape.pop(0)
-        np.testing.assert_allclose(action, expected, rtol=0.0, atol=TOLERANCE)
+        np.testing.assert_allclose(action, expected, rtol=0.0, atol=10 * BRANCHES)
         return result
 
 
@@ -121,65 +134,87 @@ def assert_same_numbers(library: Library, variables: dict[str, Any]) -> None:
     """``variables``: those of the example's `train` where it stands."""
     agent = library.trainer.agent
     assert variables["updates"] == agent.updates
+    tolerance = ROUNDING if agent.updates <= 20 else BRANCHES
     for name, expected in library.networks().items():
         found = [parameter.detach() for parameter in variables[name].parameters()]
         difference = norm([a - b for a, b in zip(found, expected, strict=True)])
-        assert difference <= TOLERANCE * norm(expected), name
+        assert difference <= tolerance * norm(expected), name
     for ours, theirs in ((variables["zeta"], agent.zeta),
                          (variables["log_alpha"], agent.log_temperature)):  # fmt: skip
-        torch.testing.assert_close(ours, theirs, rtol=TOLERANCE, atol=0.0)
+        torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=0.0)
     for name in ("critic", "policy", "certificate"):
         if name in variables["losses"]:
             loss = variables["losses"][name].item()
-            assert loss == pytest.approx(float(library.losses[name]), rel=1e-4, abs=1e-6), name
+            assert loss == pytest.approx(
+                float(library.losses[name]), rel=10 * tolerance, abs=tolerance
+            ), name
 
 
 @pytest.mark.parametrize(
     ("task", "settings", "steps", "updates"),
     [
-        # The memory forgets, episodes end, and a return meets both.
-        ("Pillars-0.15-Goal", {"hidden": 16, "replay_capacity": 480, "batch_size": 64}, 1360, 300),
-        ("Hazards-0.15-Push", {}, 560, 100),
+        # The memory forgets, episodes end, phi > eta_D > 0, zeta moves late.
+        (
+            "Pillars-0.15-Goal",
+            {"hidden": 16, "batch_size": 64, "replay_capacity": 480, "eta": 0.02,
+             "certificate_start": 0.2},
+            1360,
+            300,
+        ),
+        # zeta reaches its box, lambda its cap, and its gradient the norm to which it is clipped.
+        (
+            "Hazards-0.15-Push",
+            {"low": (0.25, 0.1, 0.1), "multiplier_cap": 0.048, "multiplier_grad_norm": 1e-4},
+            560,
+            100,
+        ),
     ],
-)
+)  # fmt: skip
 def test_example_takes_the_steps_of_the_torch_backend(
     minimal: ModuleType, task: str, settings: dict[str, Any], steps: int, updates: int
 ) -> None:
-    settings = {"num_envs": 8, "start_steps": 160, "update_every": 4, **settings}
-    envs = make_envs({"name": task, "settings": {"max_episode_steps": 30}}, settings["num_envs"])
-    library = Library(settings, envs, 7, steps)
-    run = minimal.train(minimal.Config(**settings), Playback(library), 7, steps)
+    config = minimal.Config(num_envs=8, start_steps=160, update_every=4, **settings)
+    envs = make_envs({"name": task, "settings": {"max_episode_steps": 30}}, config.num_envs)
+    library = Library(library_config(config, backend="torch"), envs, 7, steps)
+    run = minimal.train(config, Playback(library), 7, steps)
     first = None
     for number, (step, *_) in enumerate(run):
-        if number % 25 == 0 or step >= steps:
+        if number % 15 == 0 or step >= steps:
             assert_same_numbers(library, run.gi_frame.f_locals)
             first = first or library.networks()
     assert library.trainer.agent.updates == updates
     for name, last in library.networks().items():
         moved = norm([a - b for a, b in zip(first[name], last, strict=True)])
-        assert moved > 1000 * TOLERANCE * norm(last), f"{name} hardly moved: nothing was compared"
-    assert abs(library.trainer.agent.zeta[0] - 0.3) > 0.05
+        assert moved > 50 * BRANCHES * norm(last), f"{name} hardly moved: nothing was compared"
+    assert abs(library.trainer.agent.zeta[0] - 0.3) > 0.04
 
 
 def test_example_acts_for_itself_and_is_evaluated_alike(minimal: ModuleType) -> None:
     """In an environment that does not amplify differences, without playback."""
-    settings = {"num_envs": 4, "hidden": 16, "start_steps": 80, "batch_size": 32,
-                "update_every": 4, "target_entropy": -1.0}  # fmt: skip
-    library = Library(settings, ToyEnvs(4), 1, 1280)
-    run = minimal.train(minimal.Config(**settings), ToyEnvs(4), 1, 1280)
-    violations = []
-    for number, (step, policy, _, _) in enumerate(run):
+    config = minimal.Config(
+        num_envs=4, hidden=16, start_steps=80, batch_size=32, update_every=4, target_entropy=-1.0
+    )
+    library = Library(library_config(config, backend="torch"), ToyEnvs(4), 1, 800)
+    run = minimal.train(config, ToyEnvs(4), 1, 800)
+    for number, (step, policy, *_) in enumerate(run):
         library.trainer.advance(step)
-        if number % 40 == 39:
+        if number % 50 == 49:
             assert_same_numbers(library, run.gi_frame.f_locals)
-            found = minimal.evaluate(policy, ToyEnvs(5))
-            expected = evaluate(library.trainer.policy, ToyEnvs(5), 10_000)
-            assert found["return"] == pytest.approx(expected["return"], rel=1e-4)
-            assert found["violating steps"] == expected["cost_indicator"]
-            assert found["clean episodes"] == expected["zero_violation_share"]
-            violations.append(found["violating steps"])
-    assert library.trainer.agent.updates == 300
-    assert max(violations) > 0
+            mine = policy
+    assert library.trainer.agent.updates == 180
+    network = library.trainer.agent.policy
+    theirs = network.shape.layers(network.parameters.detach())[-1][1][0, 0]
+    violating = []
+    for push in (0.0, 3.0):  # towards the wall, which pays and must not be touched
+        mine[-1].bias.detach()[0] += push
+        theirs[0] += push
+        found = minimal.evaluate(mine, ToyEnvs(5))
+        expected = evaluate(library.trainer.policy, ToyEnvs(5), 10_000)
+        assert found["return"] == pytest.approx(expected["return"], rel=1e-3)
+        assert found["violating steps"] == expected["cost_indicator"]
+        assert found["clean episodes"] == expected["zero_violation_share"]
+        violating.append(found["violating steps"])
+    assert violating[0] < violating[1]
 
 
 def test_memory_of_the_example_is_that_of_the_library(minimal: ModuleType) -> None:
@@ -207,13 +242,33 @@ def test_memory_of_the_example_is_that_of_the_library(minimal: ModuleType) -> No
             torch.testing.assert_close(values, getattr(expected, name), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("task", ["Pillars-0.15-Goal", "Hazards-0.15-Push"])
+def test_observations_of_the_example_are_those_of_the_library(
+    minimal: ModuleType, task: str
+) -> None:
+    """Beyond every clip, too."""
+    envs = make_envs(task, 1)
+    raw = np.random.default_rng(0).normal(0.0, 10.0, (64, envs.single_observation_space.shape[0]))
+    infos = {"d": raw[:, :4], "d_dot": raw[:, 4:8]}
+    found, d, d_dot = minimal.observe(envs, raw, infos)
+    expected = ObservationTransform.for_layout(envs.observation_layout)(raw)
+    np.testing.assert_array_equal(found.numpy(), expected)
+    np.testing.assert_array_equal(d.numpy(), infos["d"].astype(np.float32))
+    np.testing.assert_array_equal(d_dot.numpy(), infos["d_dot"].astype(np.float32))
+
+
+def test_squashed_gaussian_of_the_example_is_that_of_the_library(minimal: ModuleType) -> None:
+    """Where tanh saturates and at the bounds of the standard deviation, too."""
+    rng = torch.Generator().manual_seed(0)
+    output, noise = 10.0 * torch.randn(64, 4, generator=rng), torch.randn(64, 2, generator=rng)
+    pairs = zip(minimal.squashed_gaussian(output, noise), squashed_gaussian(output, noise),
+                strict=True)  # fmt: skip
+    for found, expected in pairs:
+        torch.testing.assert_close(found, expected)
+
+
 def test_example_has_the_hyperparameters_of_the_library(minimal: ModuleType) -> None:
-    library = dataclasses.asdict(safemr.Config())
-    mine = dataclasses.asdict(minimal.Config())
-    names = ("sigma", "k", "n")
-    for field, suffix in (("zeta", ""), ("low", "_min"), ("high", "_max")):
-        assert mine.pop(field) == tuple(library[name + suffix] for name in names)
-    assert mine == {name: library[name] for name in mine}
+    assert library_config(minimal.Config()) == safemr.Config()
 
 
 def test_example_imports_nothing_of_safemr() -> None:
@@ -226,19 +281,42 @@ def test_example_imports_nothing_of_safemr() -> None:
     assert names - sys.stdlib_module_names == {"gymnasium", "numpy", "torch"}
 
 
+def test_example_is_a_program() -> None:
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(PROGRAM), "--help"]
+    done = subprocess.run(command, env=variables, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    assert all(option in done.stdout for option in ("--task", "--steps", "--seed"))
+
+
 @pytest.mark.parametrize(
-    ("arguments", "status", "expected"),
+    ("arguments", "complaint"),
     [
-        (["--help"], 0, "--steps"),
-        (["--task", "Pillars"], 2, "Pillars-0.15-Goal"),
-        (["--steps", "5000"], 2, "--steps must exceed"),
+        (["--task", "Pillars"], "Pillars-0.15-Goal"),
+        (["--steps", "5000"], "--steps must exceed the 5000"),
+        (["--seed", "-1"], "--seed be >= 0"),
     ],
 )
-def test_example_as_a_program(arguments: list[str], status: int, expected: str) -> None:
-    variables = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(PROGRAM), *arguments]
-    done = subprocess.run(
-        command, cwd=ROOT, env=variables, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == status
-    assert expected in done.stdout + done.stderr
+def test_example_refuses_what_it_cannot_run(
+    minimal: ModuleType, monkeypatch: Any, capsys: Any, arguments: list[str], complaint: str
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["safemr_minimal.py", *arguments])
+    with pytest.raises(SystemExit) as caught:
+        minimal.main()
+    assert caught.value.code == 2
+    assert complaint in capsys.readouterr().err
+
+
+def test_example_prints_a_line_at_each_twentieth(
+    minimal: ModuleType, monkeypatch: Any, capsys: Any
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["safemr_minimal.py", "--steps", "800"])
+    small = functools.partial(minimal.Config, hidden=8, start_steps=80, batch_size=8)
+    monkeypatch.setattr(minimal, "Config", small)
+    short = functools.partial(gymnasium.make_vec, max_episode_steps=5)
+    monkeypatch.setattr(minimal.gymnasium, "make_vec", short)
+    minimal.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 20
+    assert int(lines[-1].split("|")[0]) == 800
+    assert all(name in lines[-1] for name in ("return", "clean episodes", "sigma", "certificate"))

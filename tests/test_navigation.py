@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +24,16 @@ def make_vec(name: str, num_envs: int, **settings: Any) -> gymnasium.vector.Vect
     return gymnasium.make_vec(
         f"{name}-v0", num_envs=num_envs, vectorization_mode="vector_entry_point", **settings
     )
+
+
+def assert_equal(first: Any, second: Any) -> None:
+    """Bitwise equality of nested dictionaries of arrays and numbers."""
+    if isinstance(first, dict):
+        assert first.keys() == second.keys()
+        for key in first:
+            assert_equal(first[key], second[key])
+    else:
+        np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -81,6 +93,29 @@ def test_divergence_ends_the_episode_without_nan(
     assert np.isfinite(observation).all()
     assert np.abs(reward).max() < 1
     assert not terminated.any()
+
+
+def test_a_copy_of_a_diverged_world_has_ended_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a log file
+    env = gymnasium.make("Hazards-0.15-Push-v0").unwrapped
+    env.reset(seed=0)
+    state = env.get_state()
+    state["worlds"]["qvel"][0, 0] = 1e13
+    env.set_state(state)
+    *_, terminated, _, info = env.step(np.zeros(2, np.float32))
+    assert terminated
+    assert info["diverged"]
+    log = Path("MUJOCO_LOG.TXT")
+    warnings = log.read_text() if log.exists() else ""
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert_equal(other.get_state(), env.get_state())
+        assert_equal(other.scene().robot, env.scene().robot)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            other.step(np.zeros(2, np.float32))
+        assert_equal(other.reset(seed=1)[0], copy.copy(env).reset(seed=1)[0])
+    assert (log.read_text() if log.exists() else "") == warnings
 
 
 def test_no_room_for_a_new_goal_terminates_and_still_pays(

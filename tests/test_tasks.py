@@ -77,7 +77,9 @@ def test_the_forms_of_tasks_say_the_same() -> None:
         ({"tasks": {"X": {}}}, "unknown task 'X'"),
         ({"tasks": {"X": EIGHT, "x": EIGHT}}, "tasks names 'x' twice"),
         ({"tasks": {"X": EIGHT, "Y": EIGHT}}, "'X' and 'Y' are the same task"),
-        ({"tasks": [{"X": EIGHT, "Y": EIGHT}]}, "each of tasks must be a name or one NAME"),
+        ({"tasks": [[GOAL]]}, "each of tasks must consist of letters"),
+        ({"tasks": {}}, "tasks must be a list, not {}"),
+        ({"tasks": [GOAL, {}]}, "each of tasks must consist of letters"),
         (
             {"task_overrides": {"Pillars-8": {"settings": {"num_obstacles": 9}}}},
             "num_obstacles belongs into tasks.Pillars-8.settings",

@@ -25,6 +25,7 @@ from safemr.experiment.locks import ProcessLock
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("Snakefile", "config", "envs", "safemr", "workflow")
+TASK = "Pillars-0.15-Goal"
 GRID: dict[str, Any] = {
     "tasks": ["Pillars-0.15-Goal"],
     "algorithms": {
@@ -92,17 +93,18 @@ class Checkout:
         table = printed.partition("Job stats:")[2].partition("total")[0]
         return {name: int(count) for name, count in re.findall(r"^(\w+) +(\d+)$", table, re.M)}
 
-    def fill_in_records(self) -> None:
+    def fill_in_records(self, root: Path | None = None) -> None:
         """A record for every run of the plan, without training."""
         for run in self.plan().runs:
             rows = [
                 {
                     **{"step": step, "eval_return": 1.0, "eval_cost": 0.0},
                     **{"eval_cost_indicator": 0.0, "eval_zero_violation_share": 1.0},
+                    **({"sigma": 0.3, "k": 1.0, "n": 2.0} if run.variant == "SafeMR" else {}),
                 }
                 for step in (run.config["steps"] // 2, run.config["steps"])
             ]
-            folder = self.folder / "results" / run.path
+            folder = (root or self.folder / "results") / run.path
             records.write_record(folder, run.config, run.variant, rows, {"cpu_s": 60.0})
 
 
@@ -130,7 +132,8 @@ def test_a_fresh_clone_trains_only_what_changed(checkout: Checkout) -> None:
         os.utime(path, (generator.uniform(1e9, 1.7e9),) * 2)
     assert "train" not in checkout.scheduled()
 
-    changed = {**GRID["algorithms"], "SafeMR": {"algorithm": "safemr", "gamma": 0.98}}
+    other = {**GRID["algorithms"]["SafeMR"], "gamma": 0.98}
+    changed = {**GRID["algorithms"], "SafeMR": other}
     checkout.configure(algorithms=changed)
     assert checkout.scheduled()["train"] == 2
     checkout.configure()
@@ -157,25 +160,29 @@ def test_an_edit_makes_again_what_depends_on_it_and_only_that(checkout: Checkout
     checkout.fill_in_records()
     made = ("table_1", "training_curves", "illustrations")
     checkout.snakemake(*made)
-    assert checkout.scheduled(targets=made) == {}
+
+    def edited(*sources: str) -> dict[str, int]:
+        """What is scheduled after an edit, which is taken back."""
+        paths = [checkout.folder / source for source in sources]
+        before = [(path, path.read_text(), path.stat().st_mtime) for path in paths]
+        for path, text, _ in before:
+            path.write_text(text + "# edited\n")
+        jobs = checkout.scheduled(targets=made)
+        for path, text, time_ in before:
+            path.write_text(text)
+            os.utime(path, (time_, time_))
+        return jobs
+
+    algorithms = (
+        "safemr/algorithms/fac.py",
+        "safemr/learning/off_policy.py",
+        "safemr/report/claims.py",
+    )
+    assert edited(*algorithms) == {}
+    drawing = ("safemr/report/figures/certificate.py", "safemr/report/differences.py")
+    assert edited(*drawing) == {"illustrations": 1, "table_1": 1}
     everything = {"aggregate": 1, "controllers": 1, **dict.fromkeys(made, 1)}
-    for source, expected in {
-        "safemr/report/figures/certificate.py": {"illustrations": 1},
-        "envs/drawing.py": {"illustrations": 1},
-        "safemr/report/differences.py": {"table_1": 1},
-        "safemr/report/figures/curves.py": {"training_curves": 1},
-        "envs/assets/point.xml": {"illustrations": 1, "controllers": 1, "table_1": 1},
-        "safemr/experiment/records.py": everything,
-        "safemr/algorithms/fac.py": {},
-        "safemr/learning/off_policy.py": {},
-        "safemr/report/claims.py": {},
-    }.items():
-        path = checkout.folder / source
-        before, times = path.read_text(), (path.stat().st_atime, path.stat().st_mtime)
-        path.write_text(before + ("<!-- -->" if path.suffix == ".xml" else "# edited\n"))
-        assert checkout.scheduled(targets=made) == expected, source
-        path.write_text(before)
-        os.utime(path, times)
+    assert edited("safemr/experiment/records.py") == everything
     assert checkout.scheduled(targets=made) == {}
 
 
@@ -219,7 +226,7 @@ def test_adding_a_baseline_is_one_file_and_one_line(checkout: Checkout) -> None:
     algorithms = checkout.folder / "safemr/algorithms"
     (algorithms / "my_baseline.py").write_text((algorithms / "fac.py").read_text())
     path = checkout.folder / "config/config.yaml"
-    line = "algorithms:\n  Mine: {algorithm: my_baseline, gamma: 0.97}\n"
+    line = "algorithms:\n  Mine: {algorithm: my_baseline, gamma: 0.97, start_steps: 200}\n"
     path.write_text(path.read_text().replace("algorithms:\n", line))
     jobs = checkout.scheduled()
     assert jobs["train"] == len(GRID["tasks"]) * len(GRID["seeds"])
@@ -399,6 +406,26 @@ def test_two_snakemakes_at_once_train_every_run_once(checkout: Checkout) -> None
         folder = checkout.folder / "results" / run.path
         records.verify_record(folder)
         assert len(json.loads((folder / "provenance.json").read_text())["attempts"]) == 1
+
+
+def test_roots_outside_the_repository(tmp_path: Path) -> None:
+    """Records, lock, logs and tables lie under ../..., figures under an absolute path."""
+    (tmp_path / "here").mkdir()
+    checkout = Checkout(tmp_path / "here")
+    checkout.configure(
+        results_root="../away/results", figures_root=f"{tmp_path}/drawn", seeds=[100], tasks=[TASK]
+    )
+    away = tmp_path / "away/results"
+    assert checkout.scheduled()["train"] == 2
+    checkout.fill_in_records(away)
+    assert "train" not in checkout.scheduled()
+    checkout.snakemake("../away/results/tables/results.md", f"{tmp_path}/drawn/training_curves.png")
+    assert "SafeMR" in (away / "tables/results.md").read_text()
+    assert (tmp_path / "drawn/training_curves.png").stat().st_size > 1000
+    assert (away / ".work/snakemake.lock").exists()
+    assert (away / "logs/aggregate.log").exists()
+    assert not (checkout.folder / "results").exists()
+    assert not (checkout.folder / "paper_figures").exists()
 
 
 @pytest.mark.slow

@@ -21,13 +21,13 @@ from safemr.errors import UserError, show
 from safemr.experiment.sections import (
     LARGEST_SEED,
     Section,
+    checked_name,
     distinct,
     flag,
     integer,
     labelled,
     listed,
     mapping,
-    name_in,
     number,
     seeds_in,
 )
@@ -201,7 +201,7 @@ def parse(raw: Any) -> Config:
         figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
         allow_missing=flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
-        wandb_project=name_in(wandb.get("project", "safemr"), "wandb.project"),
+        wandb_project=checked_name(wandb.get("project", "safemr"), "wandb.project"),
         cost_tolerance=number(
             safe.get("cost_tolerance", COST_TOLERANCE), "safe.cost_tolerance", 0, math.inf
         ),
@@ -243,20 +243,13 @@ def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
     A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
     mapping of all names, those of registered tasks with nothing behind them.
     """
-    entries: list[tuple[Any, Any]] = []
-    if isinstance(value, Mapping):
-        entries += value.items()
-        if not entries:
-            raise UserError(f"{where} is empty")
-    else:
-        for item in listed(value, where):
-            if isinstance(item, Mapping) and len(item) != 1:
-                raise UserError(
-                    f"each of {where} must be a name or one NAME: {{base, settings}}, "
-                    f"not {show(item)}"
-                )
-            entries += item.items() if isinstance(item, Mapping) else [(item, None)]
-    names = [name_in(name, f"each of {where}") for name, _ in entries]
+    parts = [value] if isinstance(value, Mapping) and value else listed(value, where)
+    entries = [
+        entry
+        for part in parts
+        for entry in (part.items() if isinstance(part, Mapping) and part else [(part, None)])
+    ]
+    names = [checked_name(name, f"each of {where}") for name, _ in entries]
     distinct([name.lower() for name in names], where)
     return {
         name: _task_variant(entry, f"{where}.{name}")
@@ -269,18 +262,9 @@ def _task_variant(value: Any, where: str) -> TaskVariant | None:
         return None
     section = Section(value, where, ("base", "settings"))
     return TaskVariant(
-        name_in(section.required("base"), f"{where}.base"),
+        checked_name(section.required("base"), f"{where}.base"),
         mapping(section.required("settings"), f"{where}.settings"),
     )
-
-
-def task_name(value: Any, where: str) -> str:
-    """A name that a task may have.
-
-    Raises:
-        UserError: for anything else.
-    """
-    return name_in(value, where)
 
 
 def _budget(value: Any, where: str) -> dict[str, int]:
@@ -297,7 +281,7 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
             hint = f"; did you mean it by {near[0]!r}?" if near else ""
             raise UserError(f"{where}.{label} lacks 'algorithm'{hint}")
         variants[label] = Variant(
-            name_in(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
+            checked_name(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
         )
     if not variants:
         raise UserError(f"{where} is empty")
@@ -339,8 +323,8 @@ def _sensitivity(value: Any, seeds: Any) -> Sensitivity | None:
         points.append((a, b))
     distinct(points, "sensitivity.points")
     return Sensitivity(
-        name_in(section.required("task"), "sensitivity.task"),
-        name_in(section.required("algorithm"), "sensitivity.algorithm"),
+        checked_name(section.required("task"), "sensitivity.task"),
+        checked_name(section.required("algorithm"), "sensitivity.algorithm"),
         tuple(points),
         seeds_in(section.get("seeds", seeds), "sensitivity.seeds"),
     )
@@ -351,7 +335,7 @@ def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
         return None
     section = Section(value, "aircraft", ("task", "algorithms", "seeds"))
     return Aircraft(
-        name_in(section.get("task", "Aircraft"), "aircraft.task"),
+        checked_name(section.get("task", "Aircraft"), "aircraft.task"),
         _variants(section.required("algorithms"), "aircraft.algorithms"),
         seeds_in(section.get("seeds", seeds), "aircraft.seeds"),
     )
@@ -360,7 +344,7 @@ def _aircraft(value: Any, seeds: Any) -> Aircraft | None:
 def _outside(value: Any, where: str) -> Outside:
     section = Section(value, where, ("algorithm", "version", "steps", "hyperparameters"))
     return Outside(
-        name_in(section.required("algorithm"), f"{where}.algorithm"),
+        checked_name(section.required("algorithm"), f"{where}.algorithm"),
         integer(section.get("version", 1), f"{where}.version", 1),
         integer(section.required("steps"), f"{where}.steps", 1),
         mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),

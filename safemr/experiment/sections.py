@@ -49,7 +49,8 @@ def mapping(value: Any, where: str) -> Mapping[str, Any]:
 
 def labelled(value: Any, where: str) -> list[tuple[str, Any]]:
     items = [
-        (name_in(key, f"a name in {where}"), item) for key, item in mapping(value, where).items()
+        (checked_name(key, f"a name in {where}"), item)
+        for key, item in mapping(value, where).items()
     ]
     distinct([key.lower() for key, _ in items], where)
     return items
@@ -69,7 +70,8 @@ def distinct(items: Sequence[Any], where: str) -> None:
             raise UserError(f"{where} names {show(item)} twice")
 
 
-def name_in(value: Any, where: str) -> str:
+def checked_name(value: Any, where: str) -> str:
+    """A name as folders, figures and rules can hold it."""
     if not isinstance(value, str) or not _NAME.fullmatch(value):
         raise UserError(
             f"{where} must consist of letters, digits and . _ + - (60 at most, not beginning with "

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 from safemr.conventions import EVALUATION_SEED
 from safemr.errors import UserError, tell
 from safemr.experiment import planning, records
-from safemr.experiment.config import WANDB_MODES, task_name
+from safemr.experiment.config import WANDB_MODES
+from safemr.experiment.sections import checked_name
 from safemr.experiment.signals import StoppedError, StopSignals
 from safemr.experiment.strict_yaml import assignment
 from safemr.tasks import make_envs
@@ -215,7 +216,7 @@ def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[st
         task = planning.describe_task(arguments.task, settings, "--task")
         planning.check_name(task, "--set", "give it with --task-name")
         return task
-    name = task_name(arguments.task_name, "--task-name")
+    name = checked_name(arguments.task_name, "--task-name")
     planning.describe_task(arguments.task, settings, "--task")
     return planning.describe_task(name, settings, "--task-name", base=arguments.task)
 

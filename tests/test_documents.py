@@ -1,0 +1,178 @@
+"""Numbers in the documents that the records, the statistics or the code can tell."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import stdtrit
+
+from safemr.experiment import planning
+from safemr.learning.networks import LOG_STD_MAX, LOG_STD_MIN
+from safemr.report.statistics import difference_interval
+
+ROOT = Path(__file__).resolve().parents[1]
+ALGORITHMS = (ROOT / "docs/algorithms.md").read_text()
+REPRODUCIBILITY = (ROOT / "REPRODUCIBILITY.md").read_text()
+
+
+def text_of(document: str) -> str:
+    """Without line breaks."""
+    return " ".join(document.split())
+
+
+def column(path: Path, name: str) -> np.ndarray:
+    """A column of progress.csv, nan where it has no value."""
+    with path.open() as lines:
+        return np.array([float(row.get(name) or "nan") for row in csv.DictReader(lines)])
+
+
+def only(pattern: str) -> Path:
+    (path,) = ROOT.glob(f"results/{pattern}/progress.csv")
+    return path
+
+
+def window(path: Path, name: str, low: float, high: float) -> float:
+    """Mean over the rows after step ``low`` until ``high``."""
+    steps = column(path, "step")
+    return float(np.nanmean(column(path, name)[(steps > low) & (steps <= high)]))
+
+
+def cells(document: str, *first: str) -> list[str]:
+    """The cells of the one table row that begins with these."""
+    begin = "| " + " | ".join(first) + " |"
+    (row,) = (line for line in document.splitlines() if line.startswith(begin))
+    return [cell.strip() for cell in row.strip("|").split("|")][len(first) :]
+
+
+@pytest.mark.parametrize(("seeds", "deviations"), [(3, 3.5), (5, 2.1)])
+def test_what_a_few_seeds_can_tell_apart(seeds: int, deviations: float) -> None:
+    """Four times in five, by simulation with the intervals of the tables."""
+    random = np.random.default_rng(seeds)
+    first = random.normal(deviations, 1.0, (4_000, seeds))
+    second = random.normal(0.0, 1.0, (4_000, seeds))
+    found = [difference_interval(x, y).low > 0 for x, y in zip(first, second, strict=True)]
+    assert np.mean(found) == pytest.approx(0.8, abs=0.025)
+    said = text_of(REPRODUCIBILITY)
+    assert "their means differ by about 3.5 (n = 3) or 2.1 (n = 5) of them" in said
+    half = stdtrit(seeds - 1, 0.975) / np.sqrt(seeds)
+    assert f"{half:.1f} (n = {seeds})" in said
+
+
+@pytest.mark.parametrize("name", ["PPO-L", "TRPO-L", "CPO"])
+def test_the_runs_at_limit_25_are_told_as_recorded(name: str) -> None:
+    path = only(f"bands/runs/PointGoal1/{name}/*")
+    rows = [line for line in ALGORITHMS.splitlines() if line.startswith(f"| {name} | ")]
+    (row,) = (line for line in rows if line.count(", ") == 8)
+    _, returns, costs, multiplier = (cell.strip() for cell in row.strip("|").split("|"))
+    fifths = [(1, 2e5 * part, 2e5 * (part + 1)) for part in range(5)]
+    for cell, metric, unit in ((returns, "train_return", 0.1), (costs, "train_cost", 1.0)):
+        for said, (_, low, high) in zip(cell.split(","), fifths, strict=True):
+            assert float(said) == pytest.approx(window(path, metric, low, high), abs=0.51 * unit)
+    if name != "CPO":
+        assert float(multiplier) == pytest.approx(column(path, "multiplier")[-1], abs=0.006)
+    else:
+        reach, explained = (column(path, n) for n in ("cost_reach", "explained_variance_cost"))
+        assert f"by {np.nanmean(reach):.0f} (`cost_reach`" in text_of(ALGORITHMS)
+        assert f"at most {np.nanmax(explained):.2f} of the variance" in text_of(ALGORITHMS)
+
+
+@pytest.mark.parametrize("name", ["PPO-L", "TRPO-L", "CPO"])
+@pytest.mark.parametrize("settings", ["published", "grid"])
+def test_the_runs_at_published_settings_are_told_as_recorded(name: str, settings: str) -> None:
+    root, last = ("published", 240e3) if settings == "published" else ("pilot", 256e3)
+    path = only(f"{root}/runs/Pillars-0.15-Goal/{name}/seed100-*")
+    edges = (56e3, 104e3, 152e3, 200e3, last)
+    for cell, low, high in zip(cells(ALGORITHMS, name, settings), edges, edges[1:], strict=False):
+        said = [float(number) for number in cell.split(",")]
+        found = [window(path, metric, low, high) for metric in ("train_return", "train_cost")]
+        assert said == pytest.approx(found, abs=0.051)
+
+
+def test_the_literal_loss_is_told_as_recorded() -> None:
+    def first_gradient(variant: str) -> float:
+        paths = sorted(ROOT.glob(f"results/variants/runs/*/{variant}/*/progress.csv"))
+        assert len(paths) == 5
+        gradients = [column(path, "certificate_grad_sigma") for path in paths]
+        starts = [
+            column(path, "step")[~np.isnan(g)][0] for path, g in zip(paths, gradients, strict=True)
+        ]
+        assert set(starts) == {30_000}
+        return float(np.mean([gradient[~np.isnan(gradient)][0] for gradient in gradients]))
+
+    literal, ours = first_gradient("JointSIS-literal"), first_gradient("SafeMR")
+    said = text_of(ALGORITHMS)
+    assert f"gradient is {literal:.2f} for JointSIS-literal and {ours:.2f} for SafeMR" in said
+    slope = 2.0 * (0.3 + 0.25)  # n (sigma + d_min)^(n - 1) at the start, on Pillars-0.15-Goal
+    assert f"of about a = {literal / slope:.1f} whose" in said
+
+
+def test_the_settings_in_the_table_are_the_code_s() -> None:
+    defaults = planning.load_algorithm("safemr").hyperparameters()
+    said = text_of(ALGORITHMS)
+    assert f"log alpha = {defaults.initial_log_temperature:g} | log alpha = 0" in said
+    assert f"clamped to [{LOG_STD_MIN:g}, {LOG_STD_MAX:g}] | clamped to [-5, 1]" in said
+    assert defaults.updates_together == 4
+    updates = {
+        int(column(path, "updates")[-1])
+        for path in ROOT.glob("results/runs/*/SafeMR/*/progress.csv")
+        if "Aircraft" not in path.parts
+    }
+    assert updates == {49_376, 37_188}
+    assert "49,376 (37,188) in a run" in said
+
+
+def test_what_the_cmdp_baselines_constrain_on_push_is_told_as_recorded() -> None:
+    """Summed depth and violating steps while exploring, over the last fifth of training."""
+    found: dict[str, list[float]] = {"train_cost": [], "train_cost_indicator": []}
+    for task in ("Hazards-0.15-Push", "Hazards-0.30-Push"):
+        for name in ("PPO-L", "TRPO-L", "CPO"):
+            paths = list(ROOT.glob(f"results/runs/{task}/{name}/*/progress.csv"))
+            for metric, values in found.items():
+                values.append(np.mean([window(path, metric, 8e5, 1e6) for path in paths]))
+    depth, steps = found.values()
+    expected = (
+        f"at a cost of {min(depth):.1f} to {max(depth):.1f} and at {min(steps):.0f} to "
+        f"{max(steps):.0f} violating steps an episode"
+    )
+    assert expected in text_of(REPRODUCIBILITY)
+    for task in ("Pillars-0.15-Goal", "Pillars-0.30-Goal"):  # where the two are equal
+        for path in ROOT.glob(f"results/runs/{task}/CPO/*/progress.csv"):
+            indicator = column(path, "train_cost_indicator")
+            np.testing.assert_allclose(column(path, "train_cost"), indicator)
+
+
+def test_numbers_of_unseen_layouts_and_pairs_are_the_tables() -> None:
+    tables = ROOT / "results/variants/tables"
+    said = text_of(ALGORITHMS)
+    pairs = cells((tables / "differences.md").read_text(), "Pillars-0.15-Goal", "JointSIS-literal")
+    mean, half = pairs[0].split(" ± ")
+    assert f"(+{float(mean):.1f} ± {float(half.split()[0]):.1f})" in said
+    unseen = (tables / "unseen_layouts.md").read_text()
+    row = cells(unseen, "Pillars-0.15-Goal", "JointSIS-literal")
+    mean, half = row[4].split(" ± ")
+    more = f"returns {-float(mean):.1f} ± {float(half):.1f} *more* than that, with violations in"
+    assert f"{more} {row[6].split()[0]} of 500 episodes" in said
+    violating = cells(unseen, "Pillars-0.15-Goal", "SafeMR-floor-0.02")[6]
+    assert f"violations in {violating} unseen episodes" in said
+    released = cells(unseen, "Pillars-0.15-Goal", "JointSIS-released")[4].split(" ± ")
+    assert f"{float(released[0]):.1f} ± {float(released[1]):.1f} less than SafeMR" in said
+    results = (tables / "results.md").read_text()
+    for variant, form in (
+        ("SafeMR-floor-0", "is {} at a sigma"),
+        ("SafeMR-replay", "return, {} at a"),
+    ):
+        cell = cells(results, "Pillars-0.15-Goal", variant)[2].split(" [")[0]
+        mean, half = (float(number) for number in cell.split(" ± "))
+        assert form.format(f"{mean:.1f} ± {half:.1f}") in said
+
+
+def test_limits_of_the_published_bands_are_quoted_with_their_costs() -> None:
+    """OmniSafe's benchmark of SafetyPointGoal1: return; cost."""
+    for name, value, cost in (("PPO-L", "13.0", "25.8"), ("CPO", "20.5", "28.8")):
+        assert f"| {name} | {value} | {cost} |" in ALGORITHMS
+    assert "| PPO without constraint | 25.4 | 55.7 |" in ALGORITHMS
+    assert not re.search(r"near 25 \|", ALGORITHMS)
