@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import runpy
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,11 +16,13 @@ import pandas as pd
 import pytest
 from test_workflow import Checkout, checkout  # noqa: F401  a fixture
 
+from envs.drawing import draw_scene
 from safemr import paper
+from safemr.certificates.falsification import make_simulator
 from safemr.experiment import planning
 from safemr.measure.store import Measurements
 from safemr.report import statistics
-from safemr.report.figures import scenes
+from safemr.report.figures import curves, scenes
 from safemr.report.figures import scores as drawing
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "workflow" / "scripts"
@@ -125,6 +128,33 @@ def test_the_picture_of_the_tasks_shows_what_their_settings_say(
     counts = (4, 4, 1, 1, 8, 8)
     assert seen == dict(zip((*registered, "Pillars-8"), counts, strict=True))
     assert {path.name for path in tmp_path.iterdir()} == {"environments.pdf", "environments.png"}
+
+
+def test_panels_of_more_tasks_than_the_papers_do_not_write_over_each_other() -> None:
+    tasks = [*runs.task_names(), "Pillars-8"]
+    progress = progress_of(tasks)
+    returns, costs = (
+        statistics.learning_curves(progress, name) for name in ("eval_return", "eval_cost")
+    )
+    scores = statistics.final_scores(progress)
+    for figure in (
+        curves.training_curves(returns, costs, tasks),
+        drawing.return_against_cost(scores, tasks),
+    ):
+        figure.canvas.draw()
+        lower = figure.axes[-len(tasks) :]
+        boxes = [ax.xaxis.label.get_window_extent() for ax in lower]
+        titles = [ax.title.get_window_extent() for ax in figure.axes[: len(tasks)]]
+        for row in (boxes, titles):
+            assert all(left.x1 < right.x0 for left, right in pairwise(row))
+
+
+def test_scenes_of_tasks_of_different_extent_are_square_each() -> None:
+    layouts = {name: make_simulator(name, 1).scene(0) for name in (GOAL, "PointGoal1")}
+    figure = scenes.environments(layouts, draw_scene)
+    figure.canvas.draw()
+    for ax, extent in zip(figure.axes, (2.0, 1.5), strict=True):
+        assert ax.get_ylim() == ax.get_xlim() == (-extent - 0.3, extent + 0.3)
 
 
 def test_aggregates_say_of_which_tasks_they_are_and_what_few_runs_cannot_say() -> None:

@@ -65,7 +65,7 @@ def training_curves(
     panels, which then say so. Where budgets differ by more than a factor of two the steps are
     logarithmic, so that the shorter curves are not squeezed into a corner.
     """
-    figure = style.new_figure(style.TEXT_WIDTH, 3.3)
+    figure = style.new_figure(style.text_width(len(tasks)), 3.3)
     axes = figure.subplots(2, len(tasks), sharex="col", squeeze=False)
     for column, task in enumerate(tasks):
         for ax, table in zip(axes[:, column], (returns, costs), strict=True):
@@ -96,7 +96,7 @@ def compute_curves(
     timed = timed.drop(columns="step").rename(columns={"minutes": "step"})
     variants = style.ordered(timed["variant"].unique())  # whose records say what they cost
     crowded = len(tasks) == 1 and len(variants) > 8
-    figure = style.new_figure(style.TEXT_WIDTH, 2.9 if crowded else 2.1)
+    figure = style.new_figure(style.text_width(len(tasks)), 2.9 if crowded else 2.1)
     if crowded:
         groups = _by_base(variants)
         axes = figure.subplots(1, len(groups), squeeze=False)[0]

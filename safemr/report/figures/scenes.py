@@ -26,7 +26,7 @@ DrawScene = Callable[..., Axes]  # (ax, scene, trajectory or None)
 def environments(scenes: Mapping[str, Any], draw_scene: DrawScene) -> Figure:
     """Fig. "experimentenvs": one layout of each task; scenes: task -> scene."""
     figure = style.new_figure(style.row_width(len(scenes)), 2.0)
-    axes = figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0]
+    axes = figure.subplots(1, len(scenes), squeeze=False)[0]  # tasks differ in extent
     for ax, (task, scene) in zip(axes, scenes.items(), strict=True):
         draw_scene(ax, scene)
         _frame(ax, task)

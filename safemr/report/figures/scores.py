@@ -72,7 +72,7 @@ def return_against_cost(
         index=["task", "variant", "seed"], columns="metric", values="value"
     )
     wide = wide.rename(columns={"eval_return": "return", cost: "cost"}).reset_index()
-    figure = style.new_figure(style.TEXT_WIDTH, 2.1)
+    figure = style.new_figure(style.text_width(len(tasks)), 2.1)
     axes = figure.subplots(1, len(tasks), squeeze=False)[0]
     for ax, task in zip(axes, tasks, strict=True):
         hollow = [variant for where, variant in unsafe if where == task]

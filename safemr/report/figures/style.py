@@ -131,7 +131,15 @@ def new_figure(width: float, height: float) -> Figure:
 
 def row_width(panels: int) -> float:
     """Width in inches, of those that a page has, of a row of square panels."""
-    return (COLUMN_WIDTH, 0.8 * TEXT_WIDTH, TEXT_WIDTH)[min(panels, 3) - 1]
+    return (COLUMN_WIDTH, 0.8 * TEXT_WIDTH, text_width(panels))[min(panels, 3) - 1]
+
+
+def text_width(panels: int) -> float:
+    """Width in inches of a row of panels over both columns: as the paper's four, more are wider.
+
+    Narrower ones would write over each other; a page scales the whole row.
+    """
+    return TEXT_WIDTH * max(1.0, panels / 4)
 
 
 def steady(values: ArrayLike) -> NDArray[np.float64]:
