@@ -131,7 +131,7 @@ def test_the_picture_of_the_tasks_shows_what_their_settings_say(
 
 
 def test_panels_of_more_tasks_than_the_papers_do_not_write_over_each_other() -> None:
-    tasks = [*runs.task_names(), "Pillars-8"]
+    tasks = [*planning.task_names(), "Pillars-8"]
     progress = progress_of(tasks)
     returns, costs = (
         statistics.learning_curves(progress, name) for name in ("eval_return", "eval_cost")
