@@ -112,13 +112,11 @@ def _task_version(name: str, settings_json: str) -> int:
         if settings[setting] is None:
             raise UserError(f"task {name}: the setting {setting} has no value; leave it out")
     try:  # a batch, since that is what learners train on
-        environment = gymnasium.make_vec(
-            f"{name}-v0", vectorization_mode="vector_entry_point", **settings
-        )
+        environment: Any = make_envs({"name": name, "settings": settings}, 1)
     except Exception as error:  # the environment's own validation, whatever its type
         reason = str(error).partition(chr(10))[0].removeprefix(f"{name}: ")
         raise UserError(f"task {name}: {reason}") from error
-    version = int(environment.unwrapped.task_version)
+    version = int(environment.task_version)
     environment.close()
     return version
 
