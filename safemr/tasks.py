@@ -26,7 +26,11 @@ SIMULATION = ("sleep",)
 
 @dataclass(frozen=True)
 class Traits:
-    """What the environment of a task has; a new kind of task answers here and nowhere else."""
+    """What the environment of a task has; a new kind of task answers here and nowhere else.
+
+    There is no other word for a task's kind: whether it gets certificates, rollouts or controllers
+    is asked of what it has, never of what it is called.
+    """
 
     point_robot: (
         bool  # of which `safemr.certificates.point_robot` is a model; its scenes can be drawn

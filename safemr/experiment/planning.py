@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from safemr.experiment import records
 from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorithm
 from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
+from safemr.experiment.roles import NO_CERTIFICATE, OUTSIDE, Variants
 from safemr.learning.hyperparameters import Setting
 from safemr.names import unknown
 from safemr.tasks import (
@@ -66,6 +67,7 @@ class Plan:
 
     ``points`` maps the variant label of each sensitivity point to (a, b). A point that equals its
     base variant is that variant: nothing is trained twice. ``tasks`` are those of its runs.
+    ``grid`` and ``encounter`` are the variants on the navigation tasks and on the aircraft.
     """
 
     navigation: tuple[Run, ...]
@@ -74,6 +76,8 @@ class Plan:
     outside: tuple[Run, ...]
     points: Mapping[str, tuple[float, float]]
     tasks: Mapping[str, Described]
+    grid: Variants
+    encounter: Variants
 
     @property
     def trained(self) -> tuple[Run, ...]:
@@ -278,9 +282,23 @@ def resolve(config: Config) -> Plan:
         outside,
         points,
         {name: described(entry) for name, entry in entries.items()},
+        variants_of(config.algorithms, config.outside),
+        variants_of(config.aircraft.algorithms if config.aircraft else {}),
     )
     _check_distinct(plan)
     return plan
+
+
+def variants_of(entries: Mapping[str, Variant], outside: Iterable[str] = ()) -> Variants:
+    """Role and certificate of entries of ``algorithms``, and those of `outside` behind them."""
+    algorithms = {label: load_algorithm(entry.algorithm) for label, entry in entries.items()}
+    others = list(outside)
+    return Variants(
+        {label: entries[label].role or algorithm.role for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, OUTSIDE),
+        {label: algorithm.certificate for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, NO_CERTIFICATE),
+    )
 
 
 class _Resolver:
