@@ -30,6 +30,7 @@ import envs  # noqa: F401  (registers the tasks)
 from envs.navigation_batch import NavigationBatch
 from envs.navigation_physics import FRAME_SKIP
 from envs.tasks import NAVIGATION_TASKS
+from safemr.tasks import make_envs
 
 COLUMNS = (
     "task",
@@ -46,12 +47,11 @@ EXTRA_ENVS = 64
 
 MEMORY_PROGRAM = """
 import sys
-import gymnasium, numpy, envs
+import numpy
 from benchmarks.environments import resident_megabytes
+from safemr.tasks import make_envs
 name, num_envs, sleep = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "True"
-vector = gymnasium.make_vec(
-    name, num_envs=num_envs, vectorization_mode="vector_entry_point", sleep=sleep
-)
+vector = make_envs({"name": name, "settings": {"sleep": sleep}}, num_envs)
 vector.reset(seed=0)
 for _ in range(20):
     vector.step(numpy.zeros((num_envs, 2)))
@@ -73,9 +73,7 @@ def measure_task(
 ) -> dict[str, str | float]:
     """One row of the table: steps per CPU second of physics, batch and scalar environment."""
     env_id = f"{name}-v0"
-    batched: Any = gymnasium.make_vec(
-        env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", sleep=sleep
-    ).unwrapped
+    batched: Any = make_envs({"name": name, "settings": {"sleep": sleep}}, num_envs)
     scalar = gymnasium.make(env_id, sleep=sleep, disable_env_checker=True)
     raw = NavigationBatch(NAVIGATION_TASKS[name].with_settings(sleep=sleep), num_envs)
     batched.reset(seed=0)
@@ -106,7 +104,7 @@ def measure_task(
         "scalar steps/s": round(median(rates["scalar"])),
         "batched / raw": round(ratios["batched"], 3),
         "scalar / raw": round(ratios["scalar"], 3),
-        "MB per extra env": round(_memory_per_env(env_id, sleep), 2),
+        "MB per extra env": round(_memory_per_env(name, sleep), 2),
     }
 
 
@@ -172,11 +170,11 @@ def _spread_resets(vector: Any) -> None:
     vector.set_state(state)
 
 
-def _memory_per_env(env_id: str, sleep: bool) -> float:
+def _memory_per_env(name: str, sleep: bool) -> float:
     few, many = (
         float(
             subprocess.run(
-                [sys.executable, "-c", MEMORY_PROGRAM, env_id, str(count), str(sleep)],
+                [sys.executable, "-c", MEMORY_PROGRAM, name, str(count), str(sleep)],
                 check=True,
                 capture_output=True,
                 text=True,

@@ -15,16 +15,16 @@ from __future__ import annotations
 
 import argparse
 import csv
+import functools
 import importlib
 import time
 from collections.abc import Callable
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 
-import envs  # noqa: F401  registers the tasks
+from safemr.tasks import make_envs
 
 ALGORITHMS = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
 OMNISAFE = {
@@ -64,10 +64,7 @@ def measure(
     module = importlib.import_module(f"safemr.algorithms.{algorithm}")
     config = module.Config(**overrides)
 
-    def make_envs(count: int) -> Any:
-        return gymnasium.make_vec(f"{task}-v0", count, "vector_entry_point")
-
-    trainer = module.Trainer(config, make_envs, 100, 10**9)
+    trainer = module.Trainer(config, functools.partial(make_envs, task), 100, 10**9)
     trainer.advance(1)
     spent = dict.fromkeys(PARTS, 0.0)
     timed(trainer, spent)

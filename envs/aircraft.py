@@ -239,10 +239,8 @@ class _Encounters(Independent):
     def info(self) -> dict[str, NDArray[Any]]:
         """Info [N] or [N, 1] of the present states, with no cost: that belongs to a step."""
         zeros = ("cost", "cost_indicator", "cost_contact")
-        rewards = ("reward_approach", "reward_push", "reward_goal")
         return {
-            **{key: np.zeros(self.num_envs) for key in (*zeros, *rewards)},
-            "goal_met": np.zeros(self.num_envs, bool),
+            **{key: np.zeros(self.num_envs) for key in zeros},
             "d": self.dynamics.separation(self.states)[:, None],
             "d_dot": self.dynamics.separation_rate(self.states)[:, None],
         }

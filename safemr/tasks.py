@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
-from safemr.environments import register_tasks
+from safemr.environments import SafetyEnvs, register_tasks
 
 # The ``task`` entry of a run's config (`safemr.experiment.planning.describe_task`), or the name of
 # a registered task, which then has its own settings.
@@ -26,7 +26,11 @@ SIMULATION = ("sleep",)
 
 @dataclass(frozen=True)
 class Traits:
-    """What the environment of a task has; a new kind of task answers here and nowhere else."""
+    """What the environment of a task has; a new kind of task answers here and nowhere else.
+
+    There is no other word for a task's kind: whether it gets certificates, rollouts or controllers
+    is asked of what it has, never of what it is called.
+    """
 
     point_robot: (
         bool  # of which `safemr.certificates.point_robot` is a model; its scenes can be drawn
@@ -64,17 +68,18 @@ def task_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in settings.items() if name not in SIMULATION}
 
 
-def make_envs(task: Task, num_envs: int) -> Any:
-    """A batched environment of a task."""
+def make_envs(task: Task, num_envs: int) -> SafetyEnvs:
+    """A batched environment of a task; all of this package's are made here."""
     import gymnasium
 
     register_tasks()
-    return gymnasium.make_vec(
+    made = gymnasium.make_vec(
         f"{base_of(task)}-v0",
         num_envs,
         vectorization_mode="vector_entry_point",
         **settings_of(task),
     )
+    return cast(SafetyEnvs, made)  # Gymnasium's type has neither d_min nor snapshots
 
 
 def traits(environment: Any) -> Traits:

@@ -57,7 +57,8 @@ def play(environments: Any, weights: Array, seed: int | None) -> dict[str, Array
         inputs = features(environments.observation_layout, observations)
         actions = np.clip(np.einsum("no,noa->na", inputs, weights), -1.0, 1.0)
         observations, rewards, terminated, truncated, infos = environments.step(actions)
-        terms = (rewards, infos["cost"], infos["cost_indicator"], infos["goal_met"], running)
+        goals = infos.get("goal_met", np.zeros(count))  # where a task has goals
+        terms = (rewards, infos["cost"], infos["cost_indicator"], goals, running)
         for total, term in zip(sums.values(), terms, strict=True):
             total[running] += term[running]
         running &= ~(terminated | truncated)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -253,11 +253,13 @@ def slices(
     measurements: Measurements,
     degrees: Sequence[float] = (0, 60, 120, 180, 240, 300),
     spacing: float = 0.1,
+    method: str = paper.METHOD,
+    handcrafted: Collection[str] = (),
 ) -> tuple[Floats, Floats, list[Slice]]:
     """x [X], y [Y] over the box where encounters start, and all unsafe sets at each psi.
 
-    The learned ones are those whose zeta is trained; every set contains the disc. The solved values
-    are kept among ``measurements``.
+    The learned ones are those of all variants but the ``handcrafted``; every set contains the disc.
+    The solved values are kept among ``measurements``.
     """
     dynamics = sets.dynamics
     label, own = sets.kept_as("slices")
@@ -278,7 +280,7 @@ def slices(
     zetas = {
         str(variant): learned_zetas(comparison, str(variant))
         for variant in comparison["variant"].unique()
-        if not str(variant).startswith("FAC")
+        if variant not in handcrafted
     }
 
     def claimed(states: Floats, zeta: Sequence[float] | Floats, length_scale: float) -> Floats:
@@ -298,6 +300,7 @@ def slices(
                     if found
                 },
                 adversarial=solved["adversarial"][index],
+                method=method,
             )
         )
     return x, y, cuts

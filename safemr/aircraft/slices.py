@@ -8,6 +8,8 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from safemr import paper
+
 Array = NDArray[Any]
 
 
@@ -20,3 +22,4 @@ class Slice:
     handcrafted: Array
     learned: Mapping[str, Sequence[Array]]  # variant -> one array a seed
     adversarial: Array | None = None  # V against adversarial traffic
+    method: str = paper.METHOD  # the one of the learned that is drawn in a whole line

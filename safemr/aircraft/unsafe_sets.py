@@ -15,9 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
-import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +27,7 @@ from safemr.certificates.energy import energy, magnitude, scaled
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.learning.evaluation import Acts
-from safemr.tasks import Task, base_of, name_of, settings_of, task_settings
+from safemr.tasks import Task, base_of, make_envs, name_of, settings_of, task_settings
 
 Certificate = Callable[[Floats], Floats]
 
@@ -290,12 +288,8 @@ def fly(policy: Acts, starts: Floats, dynamics: AircraftDynamics) -> Flights:
     """
     if len(dynamics.other_turns) != 1:
         raise ValueError("flights need traffic of constant turn rate")
-    envs: Any = gymnasium.make_vec(
-        f"envs:{paper.AIRCRAFT_TASK}-v0",
-        num_envs=len(starts),
-        vectorization_mode="vector_entry_point",
-        other_turn=dynamics.other_turns[0],
-    )
+    settings = {"other_turn": dynamics.other_turns[0]}
+    envs = make_envs({"name": paper.AIRCRAFT_TASK, "settings": settings}, len(starts))
     observations, infos = envs.reset(options={"state": starts})
     running = np.ones(len(starts), bool)
     collided, effort = np.zeros(len(starts), bool), np.zeros(len(starts))

@@ -46,6 +46,7 @@ from safemr.learning.policies import network_arrays
 from safemr.learning.replay import Batch
 
 VERSION = 1
+ROLE, CERTIFICATE = "method", "network"
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from typing import Any
 from safemr.environments import register_tasks
 from safemr.errors import UserError, show
 from safemr.experiment.config import FAMILIES
+from safemr.experiment.roles import BASELINE, CERTIFICATES, NO_CERTIFICATE, ROLES
 from safemr.learning.hyperparameters import unused
 from safemr.names import unknown
 
@@ -30,6 +31,8 @@ class Algorithm:
     family: str
     hyperparameters: type[Any]  # the frozen dataclass ``Config``
     trainer: type[Any]
+    role: str = BASELINE  # what its variants are where the configuration does not say
+    certificate: str = NO_CERTIFICATE
 
     @property
     def settable(self) -> set[str]:
@@ -62,7 +65,12 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
     family = getattr(module.Trainer, "family", None)
     if family not in FAMILIES:
         raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
-    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer)
+    optional = {"ROLE": (BASELINE, ROLES), "CERTIFICATE": (NO_CERTIFICATE, CERTIFICATES)}
+    said = {part: getattr(module, part, default) for part, (default, _) in optional.items()}
+    for part, (_, known) in optional.items():
+        if said[part] not in known:
+            raise UserError(f"{file}: {part} must be one of {', '.join(known)}")
+    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer, *said.values())
 
 
 def hyperparameters(

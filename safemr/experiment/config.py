@@ -18,6 +18,7 @@ from typing import Any
 
 from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
 from safemr.errors import UserError, show
+from safemr.experiment.roles import ROLES
 from safemr.experiment.sections import (
     LARGEST_SEED,
     Section,
@@ -50,6 +51,7 @@ class Variant:
 
     algorithm: str
     overrides: Mapping[str, Any]
+    role: str | None = None  # None: that of the algorithm
 
 
 @dataclass(frozen=True)
@@ -280,9 +282,11 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
             near = difflib.get_close_matches("algorithm", settings, n=1)
             hint = f"; did you mean it by {near[0]!r}?" if near else ""
             raise UserError(f"{where}.{label} lacks 'algorithm'{hint}")
-        variants[label] = Variant(
-            checked_name(settings.pop("algorithm"), f"{where}.{label}.algorithm"), settings
-        )
+        algorithm = checked_name(settings.pop("algorithm"), f"{where}.{label}.algorithm")
+        role = settings.pop("role", None)
+        if "role" in entry and role not in ROLES:
+            raise unknown("role", role, ROLES, f"{where}.{label}")
+        variants[label] = Variant(algorithm, settings, role)
     if not variants:
         raise UserError(f"{where} is empty")
     return variants

@@ -16,6 +16,7 @@ from safemr import files
 from safemr import tasks as tasks_of
 from safemr.experiment import planning
 from safemr.experiment.config import Config
+from safemr.experiment.roles import Variants
 from safemr.files import REPOSITORY
 
 
@@ -57,7 +58,8 @@ def _from_json(saved: dict[str, Any]) -> planning.Plan:
         name: tasks_of.Described(task["entry"], tasks_of.Traits(**task["traits"]))
         for name, task in saved.pop("tasks").items()
     }
+    parts = {name: Variants(**saved.pop(name)) for name in ("grid", "encounter")}
     groups = {
         name: tuple(planning.Run(**entry) for entry in group) for name, group in saved.items()
     }
-    return planning.Plan(**groups, points=points, tasks=tasks)
+    return planning.Plan(**groups, points=points, tasks=tasks, **parts)

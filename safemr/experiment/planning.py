@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from safemr.experiment import records
 from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorithm
 from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
+from safemr.experiment.roles import NO_CERTIFICATE, OUTSIDE, Variants
 from safemr.learning.hyperparameters import Setting
 from safemr.names import unknown
 from safemr.tasks import (
@@ -66,6 +67,7 @@ class Plan:
 
     ``points`` maps the variant label of each sensitivity point to (a, b). A point that equals its
     base variant is that variant: nothing is trained twice. ``tasks`` are those of its runs.
+    ``grid`` and ``encounter`` are the variants on the navigation tasks and on the aircraft.
     """
 
     navigation: tuple[Run, ...]
@@ -74,6 +76,8 @@ class Plan:
     outside: tuple[Run, ...]
     points: Mapping[str, tuple[float, float]]
     tasks: Mapping[str, Described]
+    grid: Variants
+    encounter: Variants
 
     @property
     def trained(self) -> tuple[Run, ...]:
@@ -112,13 +116,11 @@ def _task_version(name: str, settings_json: str) -> int:
         if settings[setting] is None:
             raise UserError(f"task {name}: the setting {setting} has no value; leave it out")
     try:  # a batch, since that is what learners train on
-        environment = gymnasium.make_vec(
-            f"{name}-v0", vectorization_mode="vector_entry_point", **settings
-        )
+        environment: Any = make_envs({"name": name, "settings": settings}, 1)
     except Exception as error:  # the environment's own validation, whatever its type
         reason = str(error).partition(chr(10))[0].removeprefix(f"{name}: ")
         raise UserError(f"task {name}: {reason}") from error
-    version = int(environment.unwrapped.task_version)
+    version = int(environment.task_version)
     environment.close()
     return version
 
@@ -280,9 +282,23 @@ def resolve(config: Config) -> Plan:
         outside,
         points,
         {name: described(entry) for name, entry in entries.items()},
+        variants_of(config.algorithms, config.outside),
+        variants_of(config.aircraft.algorithms if config.aircraft else {}),
     )
     _check_distinct(plan)
     return plan
+
+
+def variants_of(entries: Mapping[str, Variant], outside: Iterable[str] = ()) -> Variants:
+    """Role and certificate of entries of ``algorithms``, and those of `outside` behind them."""
+    algorithms = {label: load_algorithm(entry.algorithm) for label, entry in entries.items()}
+    others = list(outside)
+    return Variants(
+        {label: entries[label].role or algorithm.role for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, OUTSIDE),
+        {label: algorithm.certificate for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, NO_CERTIFICATE),
+    )
 
 
 class _Resolver:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from safemr.conventions import EVALUATION_SEED
+from safemr.environments import check_envs
 from safemr.errors import UserError, tell
 from safemr.experiment import planning, records
 from safemr.experiment.config import WANDB_MODES
@@ -93,9 +94,10 @@ def train(
         )
     steps, log_every, evaluation = config["steps"], config["log_every"], config["evaluation"]
     environments = functools.partial(make_envs, config["task"])
+    evaluation_envs = environments(evaluation["episodes"])
+    check_envs(evaluation_envs)
     hyperparameters = algorithm.hyperparameters(**described["hyperparameters"])
     trainer = algorithm.trainer(hyperparameters, environments, config["seed"], steps)
-    evaluation_envs = environments(evaluation["episodes"])
     state = session.resume()
     if state is not None:
         trainer.load_state_dict(state)

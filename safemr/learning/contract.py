@@ -9,12 +9,10 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 import torch
 
+from safemr.environments import SafetyEnvs
 from safemr.learning.policies import Policy
 
-# Number of sub-environments -> a batched environment with the attributes of this repository's tasks
-# (d_min, num_obstacles, observation_layout, get_state, ...), which Gymnasium's type does not have.
-MakeEnvs = Callable[[int], Any]
-
+MakeEnvs = Callable[[int], SafetyEnvs]  # from the number of sub-environments
 
 # What is larger counts as infinite: a loss, gradient norm, value, temperature or multiplier, and a
 # parameter of the policy. The largest of the recorded runs are 844 and 4.7; a squared error of

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Sums over an episode: metric name -> key of the environment's info.
+from safemr.environments import info_of
+
+# Sums over an episode: metric name -> key of the environment's info, which may be an optional one.
 _INFO_SUMS = {
     "cost": "cost",
     "cost_indicator": "cost_indicator",
@@ -47,7 +49,7 @@ class EpisodeStatistics:
         running = self._running
         running[0] += rewards
         for row, key in enumerate(_INFO_SUMS.values(), start=1):
-            running[row] += infos[key]
+            running[row] += info_of(infos, key)
         running[-1] += 1.0
         done = terminated | truncated
         if done.any():

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from safemr.environments import SafetyEnvs
 from safemr.learning.episode_statistics import EpisodeStatistics
-
-if TYPE_CHECKING:
-    pass
 
 
 class Acts(Protocol):
@@ -19,7 +17,9 @@ class Acts(Protocol):
     def act(self, observations: NDArray[Any], deterministic: bool = True) -> NDArray[Any]: ...
 
 
-def play(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> EpisodeStatistics:
+def play(
+    policy: Acts, envs: SafetyEnvs, seed: int, deterministic: bool = True
+) -> EpisodeStatistics:
     """One episode in every sub-environment of ``envs``, which are reset with seed, seed + 1, ...
 
     Reusing ``envs`` from one call to the next gives the same layouts each time.
@@ -35,6 +35,8 @@ def play(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> Epis
     return statistics
 
 
-def evaluate(policy: Acts, envs: Any, seed: int, deterministic: bool = True) -> dict[str, float]:
+def evaluate(
+    policy: Acts, envs: SafetyEnvs, seed: int, deterministic: bool = True
+) -> dict[str, float]:
     """The averages of `EpisodeStatistics` over the episodes of `play`."""
     return play(policy, envs, seed, deterministic).pop()

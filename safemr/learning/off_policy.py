@@ -32,7 +32,7 @@ class Trainer:
 
     def __init__(self, config: Any, make_envs: MakeEnvs, seed: int, total_steps: int) -> None:
         self.config, self.step = config, 0
-        self.envs: Any = make_envs(config.num_envs)
+        self.envs = make_envs(config.num_envs)
         space = self.envs.single_action_space
         if not isinstance(space, gym.spaces.Box):
             raise TypeError(f"continuous actions are required, found {space}")

@@ -137,7 +137,6 @@ class OnPolicyTrainer(ABC):
     """The loop; `safemr.learning.contract.Trainer` says what its public methods mean."""
 
     family: ClassVar[str] = "on_policy"
-    envs: Any  # the batched environment with the attributes of this repository's tasks
 
     def __init__(
         self, config: OnPolicyConfig, make_envs: MakeEnvs, seed: int, total_steps: int

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
@@ -52,8 +54,12 @@ def comparison_table(
     comparison: pd.DataFrame,
     missing: pd.DataFrame | None = None,
     task: Task = paper.AIRCRAFT_TASK,
+    pair: Sequence[str] = (paper.METHOD, paper.ABLATION),
 ) -> Table:
-    """Learners (mean over seeds and half width of the 95% t interval), then the references."""
+    """Learners (mean over seeds and half width of the 95% t interval), then the references.
+
+    pair: the method and its ablation, which a note compares.
+    """
     caption = (
         f"{name_of(task)}. Unsafe sets against the true one (constant traffic): volume over that "
         "of the truth; share of the truth minus the collision disc that is missed (covers: at most "
@@ -66,16 +72,15 @@ def comparison_table(
         f"or [its ends] where it is cut off at a bound of the quantity. {FEW}"
     )
     trained = (comparison["kind"] == "learner").any()
-    notes = [_verdict(as_scores(comparison))] if trained else []
+    notes = [_verdict(as_scores(comparison), *pair)] if trained and len(pair) == 2 else []
     if missing is not None and len(missing):
         notes.append(f"Runs missing: {describe_missing(missing)}.")
     lines = table_lines(comparison)
     return Table("aircraft", caption, comparison, lines, tuple(filter(None, notes)))
 
 
-def _verdict(scores: pd.DataFrame) -> str:
+def _verdict(scores: pd.DataFrame, method: str, rival: str) -> str:
     """What magnitude regularization changed, with Welch's intervals; "" without both learners."""
-    method, rival = paper.LEARNERS
     texts = []
     for metric, name, factor, unit in (
         ("volume_ratio", "volume ratio", 1.0, ""),

@@ -61,7 +61,8 @@ def weight_map(
     missing: pd.DataFrame | None = None,
     rule: SafetyRule | None = None,
     task: str = paper.SENSITIVITY_TASK,
-    baseline: str = "JointSIS",
+    method: str = paper.METHOD,
+    baseline: str = paper.ABLATION,
 ) -> Table:
     """Final performance and last zeta over a grid of [a, b]; one row of `data` a point.
 
@@ -101,7 +102,7 @@ def weight_map(
                  "clean episodes", "sigma", "k", "n"],
     )  # fmt: skip
     caption = (
-        f"SafeMR over weights [a, b] on {task}: final return and its difference to {baseline}'s, "
+        f"{method} over weights [a, b] on {task}: final return and its difference to {baseline}'s, "
         "mean over seeds ± half width of the 95% interval; violating steps, clean episodes and the "
         "last sigma, k, n, means over seeds. The intervals are not corrected for the number of "
         "points."

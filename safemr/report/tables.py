@@ -159,20 +159,21 @@ def table_one(
     missing: pd.DataFrame | None = None,
     rule: SafetyRule | None = None,
     tasks: Sequence[str] = paper.TASKS,
+    method: str = paper.METHOD,
     baselines: Sequence[str] = paper.BASELINES,
 ) -> Table:
-    """Table I: returns of SafeMR and the best safe baseline, the improvement, and the paper's.
+    """Table I: returns of the method and the best safe baseline, the improvement, and the paper's.
 
     scores: a score table (`statistics.final_scores`). missing: runs of the grid that have no
     record (`statistics.missing_runs`). The best baseline is chosen on the same runs that it is
     compared with, which favours the baseline slightly and is said in the caption.
     """
     rule = rule or SafetyRule()
-    rows = [_table_one_row(scores, task, rule, baselines) for task in tasks]
-    paper = [paper.TABLE_I.get(task) for task in tasks]
+    rows = [_table_one_row(scores, task, rule, method, baselines) for task in tasks]
+    papers = [paper.TABLE_I.get(task) for task in tasks]
     data = pd.DataFrame(rows)
     lines: dict[str, list[str]] = {
-        "SafeMR": [
+        method: [
             plus_minus(r["safemr"], r["safemr_low"], r["safemr_high"], 2)
             + ("" if r["safemr_safe"] in (True, None) else " (not safe)")
             for r in rows
@@ -189,9 +190,9 @@ def table_one(
             _percent(r["improvement"], r["improvement_low"], r["improvement_high"]) for r in rows
         ],
     }
-    if any(paper):
+    if any(papers):
         lines |= {
-            f"Paper: {name}": [ABSENT if values is None else show(values) for values in paper]
+            f"Paper: {name}": [ABSENT if values is None else show(values) for values in papers]
             for name, show in (
                 ("SafeMR", lambda values: f"{values.safemr:.3f}"),
                 ("highest among safe", lambda values: f"{values.best_safe:.3f}"),
@@ -213,7 +214,7 @@ def table_one(
         [[name, *cells] for name, cells in lines.items()], columns=["Expected return", *tasks]
     )
     caption = (
-        "Table I. Efficiency of SafeMR against the best safe baseline: final return of the "
+        f"Table I. Efficiency of {method} against the best safe baseline: final return of the "
         "deterministic policy, mean over seeds with the half width of its 95% t interval; "
         "difference with Welch's, improvement with Fieller's 95% interval, which is not bounded "
         f"where the baseline cannot be told from 0. {FEW} {str(rule).capitalize()}. The best "
@@ -283,9 +284,9 @@ def push_split(
 
 
 def _table_one_row(
-    scores: pd.DataFrame, task: str, rule: SafetyRule, baselines: Sequence[str]
+    scores: pd.DataFrame, task: str, rule: SafetyRule, method: str, baselines: Sequence[str]
 ) -> dict[str, object]:
-    ours = statistics.scores_of(scores, task, paper.METHOD, "eval_return")
+    ours = statistics.scores_of(scores, task, method, "eval_return")
     best, best_returns = best_safe_baseline(scores, task, rule, baselines)
     own, other = statistics.mean_interval(ours), statistics.mean_interval(best_returns)
     gain = statistics.improvement_interval(ours, best_returns)
@@ -295,7 +296,7 @@ def _table_one_row(
     return {
         "task": task,
         "safemr": own.mean, "safemr_low": own.low, "safemr_high": own.high, "seeds": own.size,
-        "safemr_safe": rule.is_safe(scores, task, paper.METHOD),
+        "safemr_safe": rule.is_safe(scores, task, method),
         "baseline": best, "baseline_return": other.mean,
         "baseline_low": other.low, "baseline_high": other.high, "baseline_seeds": other.size,
         "baseline_runs": sum(map(len, tried)),

@@ -18,9 +18,10 @@ def table(
     episodes: int,
     rule: SafetyRule | None = None,
     layouts: int = 10,
+    method: str = paper.METHOD,
 ) -> Table:
     """A row an algorithm and task: return, its change against the final evaluations, how far it is
-    behind SafeMR's, violations.
+    behind the method's, violations.
 
     flown: `measured_scores`. scores: `statistics.final_scores`, of evaluations on ``layouts``. The
     upper end is Clopper and Pearson's one-sided 95% bound on the probability that an episode has a
@@ -35,9 +36,9 @@ def table(
         }
         before = statistics.scores_of(scores, task, variant, "eval_return")
         mean = statistics.mean_interval(ours["eval_return"])
-        method = statistics.scores_of(flown, task, paper.METHOD, "eval_return")
-        gap = statistics.difference_interval(method, ours["eval_return"])
-        if variant == paper.METHOD:
+        best = statistics.scores_of(flown, task, method, "eval_return")
+        gap = statistics.difference_interval(best, ours["eval_return"])
+        if variant == method:
             gap = Estimate(float("nan"), float("nan"), float("nan"), 0)
         steps = statistics.score_interval(flown, task, variant, rule.cost)
         total = episodes * len(ours[rule.clean])
@@ -69,14 +70,14 @@ def table(
             for row in rows
         ],
         columns=["task", "algorithm", "seeds", "safe", "return", "against the final evaluations",
-                 f"{paper.METHOD} minus it",
+                 f"{method} minus it",
                  "violating steps", "episodes with a violation", "at most"],
     )  # fmt: skip
     caption = (
         f"Final policies on {episodes} layouts that no run was evaluated on, the same for all: "
         "mean over seeds ± half width of the 95% t interval; what it changes against the final "
-        f"evaluations on {layouts} layouts; SafeMR's return minus this one, with Welch's interval; "
-        f"[the ends] of an interval that is cut off at 0. {FEW} At "
+        f"evaluations on {layouts} layouts; {method}'s return minus this one, with Welch's "
+        f"interval; [the ends] of an interval that is cut off at 0. {FEW} At "
         "most: one-sided 95% bound on the probability that an episode has a violation, as if all "
         f"episodes were independent. {str(rule).capitalize()}; here applied to these episodes."
     )

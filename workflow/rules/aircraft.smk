@@ -1,10 +1,10 @@
 # The aircraft experiment: its learners are runs of the one training rule. The solved truth is kept
 # in <results root>/.work/aircraft, which no record needs and a clone solves again (15 s).
-from safemr.experiment.recorded_energy import NEURAL as NEURAL_NAMES
-
 # Those with a neural energy function have a table and a figure of their own, and are made when
 # aircraft.algorithms has any.
-NEURAL_PLAN = [run for run in PLAN.aircraft if run.config["algorithm"]["name"] in NEURAL_NAMES]
+NEURAL_PLAN = [
+    run for run in PLAN.aircraft if PLAN.encounter.certificates[run.variant] == "network"
+]
 AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
 AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]
 NEURAL = [run for run in NEURAL_PLAN if run in RECORDED]
@@ -49,6 +49,7 @@ rule aircraft_comparison:
         root=RESULTS,
         folders=[run.path.as_posix() for run in AIRCRAFT],
         expected=expected(AIRCRAFT_PLAN),
+        pair=PLAN.encounter.pair(),
         lacking=without_policy(AIRCRAFT),
         sources=sources("aircraft_comparison"),
     message:
@@ -75,6 +76,9 @@ rule aircraft_figures:
         root=RESULTS,
         cache=f"{RESULTS}/.work/aircraft",
         task=ENCOUNTER,
+        method=PLAN.encounter.first("method", paper.METHOD),
+        pair=PLAN.encounter.pair(),
+        handcrafted=PLAN.encounter.of("handcrafted"),
         sources=sources("aircraft_figures"),
     script:
         "../scripts/aircraft_figures.py"
@@ -108,6 +112,7 @@ rule aircraft_neural:
         root=RESULTS,
         folders=[run.path.as_posix() for run in NEURAL],
         expected=expected(NEURAL_PLAN),
+        pair=PLAN.encounter.pair(),
         energy=[run.config["algorithm"]["hyperparameters"] for run in NEURAL_PLAN[:1]],
         lacking=without_policy(NEURAL),
         sources=sources("aircraft_neural"),

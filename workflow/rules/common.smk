@@ -46,6 +46,10 @@ RESULTS, FIGURES = CONFIG.results_root.as_posix(), CONFIG.figures_root.as_posix(
 RUNS = {run.path.as_posix(): run for run in PLAN.runs}
 SUMMARY = f"{RESULTS}/summary"
 LOGS = f"{RESULTS}/logs"
+# By their roles, whatever their labels: the variant that Table I is about, and the one without its
+# regularizer.
+METHOD = PLAN.grid.first("method", paper.METHOD)
+ABLATION = PLAN.grid.first("ablation", paper.ABLATION)
 TARGETS = []  # each rules file adds what `all` must make
 
 

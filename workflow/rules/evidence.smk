@@ -5,9 +5,7 @@ PAPER_TASKS = [task for task in CONFIG.tasks if task in paper.TASKS]
 BUDGET = {"seeds": list(CONFIG.seeds), "steps": dict(CONFIG.budget)}  # for captions
 
 # Variants whose certificate is learned, and of each the first recorded run on each task.
-LEARNED = [
-    label for label, entry in CONFIG.algorithms.items() if entry.algorithm in ("safemr", "joint_sis")
-]
+LEARNED = PLAN.grid.learned
 FIRST_RUNS = {}
 for entry in (*PLAN.navigation, *PLAN.sensitivity):
     learns = entry.variant in (*LEARNED, *PLAN.points)
@@ -67,6 +65,7 @@ rule certificates:
             for run in FIRST_RUNS.values()
             if run.variant in LEARNED and run.task == PICTURED
         ],
+        method=METHOD,
         states=2**13,
         episodes=min(8, CONFIG.evaluation.episodes),
         lacking=without_policy(FIRST_RUNS.values()),

@@ -11,11 +11,6 @@ if PUSH_TASKS:
     TABLES["push_split"] = "../report/push_split.rst"
 
 
-# Whatever is neither SafeMR nor a form of it; a baseline that somebody adds counts in Table I.
-METHODS = ("safemr", "neural_safemr")
-BASELINES = [label for label, entry in CONFIG.algorithms.items() if entry.algorithm not in METHODS]
-
-
 rule table_1:
     input:
         scores=rules.aggregate.output.scores,
@@ -31,7 +26,9 @@ rule table_1:
     params:
         **GRID,
         **BUDGET,
-        baselines=[*BASELINES, *CONFIG.outside],
+        method=METHOD,
+        # A baseline that somebody adds counts in Table I.
+        baselines=PLAN.grid.rivals,
         push=PUSH_TASKS,
         layouts=CONFIG.evaluation.episodes,
         expected=expected((*PLAN.navigation, *PLAN.outside)),
@@ -126,6 +123,7 @@ rule final_scores:
     params:
         **GRID,
         **BUDGET,
+        method=METHOD,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
         sources=sources("final_scores"),
@@ -166,6 +164,11 @@ rule certificate_paths:
             run.variant: {**run.config["algorithm"], "steps": run.config["steps"]}
             for run in PLAN.navigation
             if run.variant in LEARNED and run.task == CONFIG.tasks[0]
+        },
+        groups={
+            members[0]: members
+            for role in ("method", "ablation")
+            if (members := [label for label in PLAN.grid.of(role) if label in LEARNED])
         },
         sources=sources("certificate_paths"),
     script:
@@ -216,6 +219,7 @@ rule policies:
     params:
         tasks=ROBOT_TASKS,
         variants=LEARNED,
+        method=METHOD,
         steps=300,
         sources=sources("policies"),
     script:

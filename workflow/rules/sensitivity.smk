@@ -2,6 +2,8 @@
 LEARNED_AT_POINTS = dict(
     task=CONFIG.sensitivity and CONFIG.sensitivity.task,
     expected=expected(PLAN.sensitivity),
+    method=CONFIG.sensitivity and CONFIG.sensitivity.variant,
+    ablation=ABLATION,
     points={label: list(point) for label, point in PLAN.points.items()},
 )
 

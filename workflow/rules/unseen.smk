@@ -52,6 +52,7 @@ rule unseen_table:
     params:
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
         layouts=CONFIG.evaluation.episodes,
+        method=METHOD,
         tolerance=CONFIG.cost_tolerance,
         clean_share=CONFIG.zero_violation_share,
         sources=sources("unseen_table"),

@@ -22,4 +22,5 @@ with reported_errors():
 comparison.to_csv(output.comparison, index=False)
 scoring.as_scores(comparison, name_of(params.task)).to_csv(output.scores, index=False)
 missing = statistics.missing_runs(expected, runs)
-tables.comparison_table(comparison, missing, params.task).write(Path(output.markdown).parent)
+table = tables.comparison_table(comparison, missing, params.task, params.pair)
+table.write(Path(output.markdown).parent)

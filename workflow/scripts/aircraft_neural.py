@@ -5,7 +5,6 @@ from pathlib import Path
 import pandas as pd
 import torch
 
-from safemr import paper
 from safemr.aircraft import neural, reachability
 from safemr.aircraft.scoring import TrueSets
 from safemr.conventions import COVERS
@@ -36,7 +35,7 @@ comparison.to_csv(output.comparison, index=False)
 missing = statistics.missing_runs(expected, runs)
 neural_table(comparison, missing).write(Path(output.markdown).parent)
 # One seed of each in the slice, every seed on the trade-off, beside the learners of zeta.
-learned = others["variant"].isin(paper.LEARNERS)
+learned = others["variant"].isin(params.pair)
 beside = others[learned | (others["kind"] == "certificate")]
 points = pd.concat([beside, comparison[comparison["kind"] != "certificate"]])
 d_min = reachability.CONSTANT.d_min

@@ -20,12 +20,5 @@ for variant, described in params.algorithms.items():
     for step, updates in log.groupby("step")["value"].mean().items():
         rows.append((variant, step, joint_sis.travelled(config, updates, total)))
 travelled = pd.DataFrame(rows, columns=["variant", "step", "travel"])
-names = {"safemr": "SafeMR", "joint_sis": "JointSIS"}
-groups = {
-    title: [v for v, described in params.algorithms.items() if described["name"] == name]
-    for name, title in names.items()
-}
-figure = curves.certificate_paths(
-    progress, travelled, groups={title: members for title, members in groups.items() if members}
-)
+figure = curves.certificate_paths(progress, travelled, groups=params.groups)
 style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))

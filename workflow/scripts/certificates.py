@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from safemr import paper
 from safemr.errors import reported_errors
 from safemr.measure import certify
 from safemr.measure.store import Measurements
@@ -30,7 +29,7 @@ with reported_errors():
     chosen = [(certificate, certify.DEFAULT_TASK) for certificate in papers]
     chosen += [learned[folder] for folder in params.pictured] or jobs[-1:]
     # The map is that of the last one.
-    chosen.sort(key=lambda job: job[0].name.partition(" (")[0] == paper.METHOD)
+    chosen.sort(key=lambda job: job[0].name.partition(" (")[0] == params.method)
     mapped = certify.measured_margins(measurements, *chosen[-1])
     figure = certificates.picture([certificate for certificate, _ in chosen], *mapped)
 table = certificates.certificate_table(rows)

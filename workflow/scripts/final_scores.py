@@ -35,9 +35,10 @@ if scale:  # the paper's return is the unit
         (final, "aggregate_scores", "return"),
         (rule.safe_returns(final), "aggregate_safe_scores", "safe return"),
     ):
-        aggregates = statistics.aggregate(chosen, params.variants, paper.METHOD, scale, thresholds)
+        aggregates = statistics.aggregate(chosen, params.variants, params.method, scale, thresholds)
         figures[file] = drawing.aggregate_scores(
             aggregates,
+            method=params.method,
             name=name,
             absent=[variant for variant in params.variants if variant not in aggregates.profiles],
             tasks=() if len(scale) == len(params.tasks) else tuple(scale),

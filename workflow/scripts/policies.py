@@ -5,7 +5,7 @@ from pathlib import Path
 import pandas as pd
 
 from envs.drawing import draw_scene
-from safemr import files, paper
+from safemr import files
 from safemr.measure import tracks
 from safemr.report.figures import certificate, scenes, style
 
@@ -25,7 +25,7 @@ def recorded(task, part):
 
 episodes = {task: recorded(task, "episodes") for task in params.tasks}
 maps = {task: recorded(task, "map") for task in params.tasks}
-method = paper.METHOD if paper.METHOD in params.variants else params.variants[0]
+method = params.method if params.method in params.variants else params.variants[0]
 figures = [
     certificate.multiplier_maps(
         {task: found[method] for task, found in maps.items() if method in found}, params.tasks

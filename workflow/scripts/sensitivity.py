@@ -14,7 +14,7 @@ chosen = progress[progress["task"] == params.task]
 returns, costs = (
     statistics.learning_curves(chosen, metric) for metric in ("eval_return", "eval_cost")
 )
-figure = curves.sensitivity(returns, costs, points)
+figure = curves.sensitivity(returns, costs, points, method=params.method, baseline=params.ablation)
 style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))
 learned = statistics.last_values(chosen, ("sigma", "k", "n"))
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])

@@ -16,7 +16,12 @@ missing = statistics.missing_runs(expected, runs)
 rule = tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
 made = [
     tables.table_one(
-        learned, missing=missing, rule=rule, tasks=params.tasks, baselines=params.baselines
+        learned,
+        missing=missing,
+        rule=rule,
+        tasks=params.tasks,
+        method=params.method,
+        baselines=params.baselines,
     ),
     tables.full_results(scores, missing=missing, rule=rule, layouts=params.layouts),
     differences.differences(learned, missing=missing),

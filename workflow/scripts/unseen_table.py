@@ -13,6 +13,7 @@ table = unseen_layouts.table(
     pd.read_csv(snakemake.input.scores),
     episodes=params.episodes,
     layouts=params.layouts,
+    method=params.method,
     rule=tables.SafetyRule(params.tolerance, params.clean_share),
 )
 source = f"{params.episodes} unseen layouts"

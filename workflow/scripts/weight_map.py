@@ -19,6 +19,8 @@ table = sensitivity.weight_map(
     missing=statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs)),
     rule=tables.SafetyRule(params.tolerance, params.clean_share),
     task=params.task,
+    method=params.method,
+    baseline=params.ablation,
 )
 table.write(Path(snakemake.output.table[0]).parent)
 style.save(drawings.weight_map(table.data), Path(snakemake.output.pdf[0]).with_suffix(""))

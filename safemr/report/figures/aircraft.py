@@ -6,7 +6,7 @@ metres: ``truth`` is the value V (unsafe where <= 0), the others are unsafe wher
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,7 +56,7 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     for variant in reversed(style.ordered(cut.learned)):
         for phi in cut.learned[variant]:
             ax.contour(x, y, style.steady(phi).T, levels=[0], colors=[style.colour(variant)],
-                       linewidths=1.0, linestyles=[_dash(variant)], zorder=6)  # fmt: skip
+                       linewidths=1.0, linestyles=[_dash(variant, cut)], zorder=6)  # fmt: skip
     draw_aircraft(ax, 0.0, 0.0, 0.0, "#0072B2")
     ax.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.xaxis.set_major_locator(MultipleLocator(5))
@@ -65,16 +65,16 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     return ax
 
 
-def _dash(variant: str) -> object:
+def _dash(variant: str, cut: Slice) -> object:
     """The learners' boundaries often coincide: the rival's dashes let the method's line through."""
-    return "-" if variant == "SafeMR" else (0, (5, 2.5))
+    return "-" if variant == cut.method else (0, (5, 2.5))
 
 
 def _handles(cut: Slice) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Patch(fc=(*_rgb(TRUE), 0.13), ec=TRUE, lw=2.0, label="true unsafe set"),
         *(
-            Line2D([], [], color=style.colour(v), ls=_dash(v), lw=1.0, label=style.label(v))
+            Line2D([], [], color=style.colour(v), ls=_dash(v, cut), lw=1.0, label=style.label(v))
             for v in style.ordered(cut.learned)
         ),
         Line2D([], [], color=style.colour(_HANDCRAFTED), ls=(0, (1.5, 1)), lw=1.2,
@@ -131,9 +131,16 @@ def single(x: Array, y: Array, cut: Slice, d_min: float) -> Figure:
 
 
 def draw_frontier(
-    ax: Axes, frontier: pd.DataFrame, comparison: pd.DataFrame, covers: float
+    ax: Axes,
+    frontier: pd.DataFrame,
+    comparison: pd.DataFrame,
+    covers: float,
+    handcrafted: Collection[str] = (),
 ) -> Axes:
-    """Volume ratio against missed share [%], of the best members of the family and of the runs."""
+    """Volume ratio against missed share [%], of the best members of the family and of the runs.
+
+    Of ``handcrafted`` variants the certificate is the fixed one, which is drawn once.
+    """
     ax.axvspan(0, 100 * covers, color="0.93", lw=0)
     ax.axhline(1, color=TRUE, lw=1.0)
     ax.fill_between(100 * frontier["missed_share"], 0, frontier["volume_ratio"], fc="none",
@@ -149,7 +156,7 @@ def draw_frontier(
         ax.plot(100 * row["missed_share"], row["volume_ratio"], marker=marker, color=tint, ms=6,
                 mec="k" if marker == "1" else "white", mew=1.2 if marker == "1" else 0.5,
                 ls="none", clip_on=False, zorder=4)  # fmt: skip
-    for variant in style.ordered(_moving(comparison)):
+    for variant in style.ordered(_moving(comparison, handcrafted)):
         run = comparison[comparison["variant"] == variant]
         ax.plot(100 * run["missed_share"], run["volume_ratio"], marker=style.marker(variant),
                 color=style.colour(variant), ms=4.5, mec="white", mew=0.4, ls="none",
@@ -165,25 +172,29 @@ def draw_frontier(
     return ax
 
 
-def _moving(comparison: pd.DataFrame) -> list[str]:
-    """Learners whose certificate is learned: with FAC it is the fixed one, drawn already."""
+def _moving(comparison: pd.DataFrame, handcrafted: Collection[str] = ()) -> list[str]:
+    """Learners whose certificate is learned."""
     learners = comparison[comparison["kind"] == "learner"]
-    names = learners["variant"].unique()
-    return [name for name in names if not str(name).startswith("FAC")]
+    return [name for name in learners["variant"].unique() if name not in handcrafted]
 
 
 @style.styled
-def frontier(best: pd.DataFrame, comparison: pd.DataFrame, covers: float) -> Figure:
+def frontier(
+    best: pd.DataFrame,
+    comparison: pd.DataFrame,
+    covers: float,
+    handcrafted: Collection[str] = (),
+) -> Figure:
     """Where each run lies on the trade-off that the energy family allows."""
     figure = style.new_figure(style.COLUMN_WIDTH, 3.0)
-    draw_frontier(figure.subplots(), best, comparison, covers)
+    draw_frontier(figure.subplots(), best, comparison, covers, handcrafted)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color="k", lw=1.4, label=r"frontier over $[\sigma,k,n]$"),
         Line2D([], [], color=TRUE, lw=1.0, label="true volume"),
         *(
             Line2D([], [], color=style.colour(v), marker=style.marker(v), ls="none", ms=4.5,
                    label=style.label(v))
-            for v in style.ordered(_moving(comparison))
+            for v in style.ordered(_moving(comparison, handcrafted))
         ),
         Line2D([], [], color=style.colour("FAC-phih"), marker="X", ls="none", ms=6, mec="white",
                mew=0.5, label=_HANDCRAFTED_LABEL),
@@ -226,7 +237,7 @@ def neural(
         Line2D([], [], color="k", lw=1.2, ls="--", label="network fitted to the truth"),
         *(
             Line2D([], [], color=style.colour(v), marker=style.marker(v), ms=4.5, lw=1.0,
-                   ls=_dash(v) if v in cut.learned else "none", label=style.label(v))
+                   ls=_dash(v, cut) if v in cut.learned else "none", label=style.label(v))
             for v in style.ordered(_moving(comparison))
         ),
         *_handles(replace(cut, learned={})),

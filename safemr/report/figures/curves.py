@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from safemr import paper
 from safemr.report.figures import style
 
 # One hue for SafeMR everywhere; the [a, b] points differ in lightness and dash.
@@ -124,7 +125,8 @@ def sensitivity(
     costs: pd.DataFrame,
     points: Mapping[str, tuple[float, float]],
     *,
-    baseline: str = "JointSIS",
+    method: str = paper.METHOD,
+    baseline: str = paper.ABLATION,
     cost_name: str = "cost",
 ) -> Figure:
     """Fig. "sensitive": return and cost for each [a, b] and for the baseline without regularizer.
@@ -134,7 +136,7 @@ def sensitivity(
     looks = {
         variant: _POINT_SHADES[index % len(_POINT_SHADES)] for index, variant in enumerate(points)
     }
-    names = {variant: f"SafeMR, $[a, b]=[{a:g}, {b:g}]$" for variant, (a, b) in points.items()}
+    names = {variant: f"{method}, $[a, b]=[{a:g}, {b:g}]$" for variant, (a, b) in points.items()}
     wanted = [*points, baseline]
     figure = style.new_figure(0.8 * style.TEXT_WIDTH, 2.3)
     axes = figure.subplots(1, 2)
@@ -157,7 +159,7 @@ def parameter_evolution(
     progress: pd.DataFrame,
     tasks: Sequence[str],
     *,
-    variants: Sequence[str] = ("SafeMR", "JointSIS"),
+    variants: Sequence[str] = (paper.METHOD, paper.ABLATION),
     fixed: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Figure:
     """sigma, k and n during training: one thin line a seed, the mean bold; one row a task.

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
+from safemr import paper
 from safemr.report.figures import style
 from safemr.report.statistics import FEWEST_RUNS, Aggregates, Estimate
 
@@ -127,7 +128,7 @@ def draw_intervals(estimates: Mapping[str, Estimate], ax: Axes, *, neutral: floa
 def aggregate_scores(
     aggregates: Aggregates,
     *,
-    method: str = "SafeMR",
+    method: str = paper.METHOD,
     name: str = "return",
     absent: Sequence[str] = (),
     tasks: Sequence[str] = (),
