@@ -3,7 +3,7 @@
 At the sizes of this work three quarters of a PyTorch update go into dispatching about 170 small
 operations. Here a critic step, a policy step and a batch of targets are one call each. What is
 computed is defined by the losses in `safemr.learning.losses`; gradients are written out by hand and
-tested against autograd. The formulas of the losses and of Adam are therefore the only ones that
+tested against PyTorch's. The formulas of the losses and of Adam are therefore the only ones that
 occur twice in this repository.
 
 Arrays are float32 and C-contiguous. The batch is the last axis of everything inside (activations
