@@ -244,6 +244,7 @@ def write_lock() -> int:
     wanted = [
         *project["project"]["dependencies"],
         *project["project"]["optional-dependencies"]["test"],
+        *project["project"]["optional-dependencies"]["wandb"],  # a setting of the configuration
         *project["build-system"]["requires"],
     ]
     with tempfile.TemporaryDirectory() as scratch:

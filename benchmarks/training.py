@@ -7,7 +7,7 @@ run's own states for the environment, and its matrix products, each timed alone 
 by whichever of PyTorch and scipy's BLAS is faster. Everything else is counted as overhead:
 activations, biases, losses, Adam, gathering samples, sensors, resets, Python. The products are
 those that the ``torch`` backend asks PyTorch for, recorded while it trains, without the gradients
-with respect to observations, which nothing needs and the ``fused`` backend leaves out.
+with respect to observations, which nothing needs and the numba backend leaves out.
 
 Times are CPU time of this process, per 1,000 environment steps, with a replay memory as full as in
 the middle of a long run; backends take turns block by block, and the table shows medians of blocks.

@@ -1,6 +1,6 @@
 """Replay of recorded Safety Gym trajectories: the physics and formulas, one step at a time.
 
-    python -m envs.golden FILE.npz ... [--tolerance 1e-9] [--sleep]
+    safemr golden FILE.npz ... [--tolerance 1e-9] [--sleep]
 
 Before each step the recorded state (positions, velocities, the solver's warm start) and goal are
 restored, so that errors do not accumulate: the robot's yaw servo makes free runs chaotic. Printed
@@ -154,7 +154,7 @@ def _layout(recording: Recording, config: Mapping[str, Any]) -> Layout:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="envs.golden",
+        prog="safemr golden",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -184,7 +184,3 @@ def main(arguments: list[str] | None = None) -> int:
             status = 1
     print("passed" if status == 0 else f"FAILED: an error above {options.tolerance:g}")
     return status
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,43 @@
+"""The public face: what a program or a notebook outside this repository needs.
+
+load_policy      the trained policy of a record, to act with
+read_records     all records under a results root as tables
+evaluate_record  a recorded policy on layouts of its task
+make_envs        a batched environment of a task
+UserError        what all of them raise where the user can fix it
+
+Each is imported when it is first asked for: `import safemr` itself costs nothing. Within the
+repository a name is imported from its module, where `safemr.experiment.sources` sees it.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from safemr.errors import UserError
+    from safemr.experiment.records import read_records
+    from safemr.learning.policies import load_policy
+    from safemr.measure.evaluate import evaluate_record
+    from safemr.tasks import make_envs
+
+__all__ = ["UserError", "evaluate_record", "load_policy", "make_envs", "read_records"]
+
+_HOMES = {
+    "UserError": "safemr.errors",
+    "evaluate_record": "safemr.measure.evaluate",
+    "load_policy": "safemr.learning.policies",
+    "make_envs": "safemr.tasks",
+    "read_records": "safemr.experiment.records",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

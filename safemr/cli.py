@@ -6,6 +6,10 @@ safemr certify ...    check a learned energy function
 safemr records ...    verify the records under a results root and say what is unfinished
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
+safemr documents ...  put the tables that the pipeline made into documents
+safemr controllers .. score the scripted controllers
+safemr slices FILE    compare the reachability solver with reference slices
+safemr golden FILE .. replay recorded Safety Gym trajectories
 """
 
 from __future__ import annotations
@@ -25,6 +29,10 @@ COMMANDS = {
     "records": "safemr.experiment.overview",
     "list": "safemr.experiment.listing",
     "config": "safemr.experiment.config",
+    "documents": "safemr.report.documents",
+    "controllers": "safemr.measure.controllers",
+    "slices": "safemr.aircraft.reachability.check",
+    "golden": "envs.golden",
 }
 
 

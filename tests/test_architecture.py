@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -119,6 +120,15 @@ def test_rooms_import_downwards_and_without_circles() -> None:
     assert len(modules) > 60
     assert upward(modules) == set()
     assert in_circles(modules) == set()
+
+
+def test_the_page_of_the_architecture_has_the_rooms_in_this_order() -> None:
+    page = (ROOT / "docs/architecture.md").read_text()
+    cells = re.findall(r"^\| (`.+?) \|", page, re.MULTILINE)
+    assert tuple(re.findall(r"`(\w+)`", " ".join(cells))) == ROOMS
+    paths = re.findall(r"`((?:safemr|envs|workflow|config|tests)/[\w./]*)`", page)
+    assert len(paths) > 20
+    assert [path for path in paths if not (ROOT / path).exists()] == []
 
 
 def test_a_planted_violation_is_found(tmp_path: Path) -> None:

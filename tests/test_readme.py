@@ -64,9 +64,7 @@ def test_the_worked_example_is_an_algorithm_of_one_file():
 def test_the_tables_in_a_document_are_those_of_the_pipeline(document):
     text = (ROOT / document).read_text()
     assert "<!-- table: results/tables/" in text
-    assert documents.with_tables(ROOT / document) == text, (
-        "run: python -m safemr.report.documents " + document
-    )
+    assert documents.with_tables(ROOT / document) == text, "run: safemr documents " + document
 
 
 def test_a_table_is_put_between_its_marks_and_nowhere_else(tmp_path):

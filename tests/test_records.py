@@ -248,7 +248,7 @@ def test_writing_again_after_a_crash_in_between(record: Path, tmp_path: Path) ->
     records.verify_record(record)
 
 
-def test_inspection_names_faults_and_unfinished_runs(
+def test_the_overview_names_faults_and_unfinished_runs(
     record: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert overview.main([str(tmp_path)]) == 0

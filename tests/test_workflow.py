@@ -371,7 +371,7 @@ def test_from_nothing_to_figures_across_a_kill(checkout: Checkout) -> None:
     assert not list(checkout.folder.glob("results/.work/*/*"))
     for name in ("paper_figures/training_curves.pdf", "results/tables/table1.md"):
         assert (checkout.folder / name).stat().st_size > 500
-    # Nothing is left to do, also when the training rule's text or the mirror changes.
+    # Nothing is left to do, also when the training rule's text or the copy to wandb changes.
     rule = checkout.folder / "workflow/rules/train.smk"
     rule.write_text(rule.read_text().replace("--wait", "--wait "))
     checkout.configure(seeds=[100], wandb={"mode": "offline"})

@@ -13,7 +13,7 @@ the episode's length in steps, c = EpCost - cost_limit, H the Fisher matrix, del
 | its dual and the feasible cases (eq. 12, theorem 2) | `solve_dual` |
 | recovery when nothing is feasible (eq. 14) | `solve_dual`, case 0 |
 | backtracking (section 6.1) | `trust_region.line_search`, `Trainer._accepts` |
-| advantages and returns (GAE, eq. 16) | `rollout.gae` |
+| advantages and returns (GAE, eq. 16) | `rollouts.gae` |
 
 Differences from the paper: the cost is an episode's undiscounted sum, as the limit is, so b is
 scaled by its length rather than by 1 / (1 - gamma); no shaping of the cost. From

@@ -8,7 +8,7 @@ of Schulman et al., "Proximal policy optimization algorithms" (arXiv:1707.06347)
 | L^CLIP (PPO, eq. 7) | `clipped_surrogate` |
 | (surrogate - lambda cost surrogate) / (1 + lambda) (Ray et al.) | `lagrange.penalised` |
 | dual ascent on lambda (EpCost - cost_limit) | `lagrange.Multiplier` |
-| advantages and returns (GAE, eq. 16) | `rollout.gae` |
+| advantages and returns (GAE, eq. 16) | `rollouts.gae` |
 
 Differences from the papers and from safety-starter-agents: minibatches instead of full-batch
 passes (``PUBLISHED`` restores them), orthogonal initialisation with a last policy layer of gain

@@ -9,7 +9,7 @@ of Schulman et al., "Trust region policy optimization" (arXiv:1502.05477).
 | natural gradient step, line search (appendix C) | `trust_region.natural_step`, `line_search` |
 | (surrogate - lambda cost surrogate) / (1 + lambda) (Ray et al.) | `lagrange.penalised` |
 | dual ascent on lambda (EpCost - cost_limit) | `lagrange.Multiplier` |
-| advantages and returns (GAE, eq. 16) | `rollout.gae` |
+| advantages and returns (GAE, eq. 16) | `rollouts.gae` |
 
 Differences from the papers and from safety-starter-agents: those of `ppo_lagrangian` as far as
 they concern critics, networks and time limits; Fisher products in Gauss-Newton form, exact here.

@@ -221,7 +221,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         }
 
     def record(self, row: Mapping[str, float]) -> None:
-        """Append a progress row and mirror all rows to ``.work/<digest>/progress.csv``."""
+        """Append a progress row and copy all rows to ``.work/<digest>/progress.csv``."""
         self.rows.append(dict(row))
         with self._survive_full_disk("progress"):
             text = records.format_progress(self.rows)

@@ -8,6 +8,7 @@ environment.
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import math
 import re
@@ -384,4 +385,9 @@ def main(arguments: Sequence[str]) -> None:
     Raises:
         UserError: as `load` does.
     """
-    load(arguments)
+    parser = argparse.ArgumentParser(
+        prog="safemr config",
+        description="Check configuration files, each put over the ones before it.",
+    )
+    parser.add_argument("files", nargs="+", metavar="FILE")
+    load(parser.parse_args(arguments).files)

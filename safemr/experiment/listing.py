@@ -92,10 +92,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number, lines in enumerate(blocks or [overview()]):
         tell("\n" * (number > 0) + "\n".join(lines), sys.stdout)
     return 0
-
-
-if __name__ == "__main__":
-    from safemr.errors import reported_errors
-
-    with reported_errors():
-        raise SystemExit(main())

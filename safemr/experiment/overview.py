@@ -44,7 +44,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(line)
     print(f"{len(found) - len(broken)} records verified, {len(broken)} refused")
     return 1 if broken else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -78,7 +78,7 @@ def train(
     """
     import torch
 
-    from safemr.experiment.wandb_log import Mirror
+    from safemr.experiment.wandb_log import WandbLog
     from safemr.learning.contract import check_parameters
     from safemr.learning.evaluation import evaluate
 
@@ -103,7 +103,7 @@ def train(
         trainer.load_state_dict(state)
         tell(f"{label} continues at step {trainer.step}", stream)
     progress = Progress(label, steps, stream)
-    with Mirror(config, session, wandb or {}) as mirror:
+    with WandbLog(config, session, wandb or {}) as wandb_log:
         while trainer.step < steps:
             begun, before = time.perf_counter(), trainer.step
             metrics = trainer.advance(min((before // log_every + 1) * log_every, steps))
@@ -121,7 +121,7 @@ def train(
             }
             session.record(row)
             progress.show(row)
-            mirror.log(row)
+            wandb_log.log(row)
             session.maybe_checkpoint(trainer.state_dict)
     session.finish(trainer.policy.arrays())
 

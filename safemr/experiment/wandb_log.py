@@ -7,15 +7,17 @@ from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Self
 
-from safemr.errors import tell
+from safemr.errors import UserError, tell
 from safemr.experiment.checkpoints import RunSession
 
+INSTALL = 'install it by `pip install "safemr[wandb]"`'
 
-class Mirror(contextlib.AbstractContextManager["Mirror"]):
+
+class WandbLog(contextlib.AbstractContextManager["WandbLog"]):
     """Logs rows to wandb when its mode is ``offline`` or ``online``.
 
-    Runs are grouped by task and algorithm. The first failure is reported once and ends the mirror;
-    it never ends the run.
+    Runs are grouped by task and algorithm. The first failure, a missing package included, is told
+    once and ends the copy; it never ends the run.
     """
 
     def __init__(
@@ -41,12 +43,17 @@ class Mirror(contextlib.AbstractContextManager["Mirror"]):
             self._attempt(lambda: self._run.finish(exit_code=0 if kind is None else 1))
 
     def log(self, row: Mapping[str, float]) -> None:
-        """Mirrors one progress row."""
+        """Copies one progress row."""
         if self._run is not None:
             self._attempt(lambda: self._run.log(dict(row), step=int(row["step"])))
 
     def _start(self) -> None:
-        import wandb
+        try:
+            import wandb
+        except ModuleNotFoundError as error:
+            if error.name != "wandb":  # it is there, and broken
+                raise
+            raise UserError(f"the package is missing; {INSTALL}") from error
 
         task, seed = self._config["task"]["name"], self._config["seed"]
         # Beside the run's working folder, which is removed when the record is written.

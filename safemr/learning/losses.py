@@ -1,6 +1,6 @@
 """The equations of the soft actor-critic family, one function each, differentiable.
 
-Both backends step on these: `safemr.learning.torch_steps` by autograd, which makes them the
+Both backends step on these: `safemr.learning.torch_steps` by PyTorch's derivatives, the
 definition of a step, and `safemr.learning.numba_steps` by gradients that are written out and tested
 against it. What the constraint is, the change of an energy or a cost, the algorithm says.
 """

@@ -2,8 +2,8 @@
 
 At the sizes of this work three quarters of a PyTorch update go into dispatching about 170 small
 operations. Here a critic step, a policy step and a batch of targets are one call each. What is
-computed is defined by the losses in `safemr.algorithms.fac`; gradients are written out by hand and
-tested against autograd. The formulas of the losses and of Adam are therefore the only ones that
+computed is defined by the losses in `safemr.learning.losses`; gradients are written out by hand and
+tested against PyTorch's. The formulas of the losses and of Adam are therefore the only ones that
 occur twice in this repository.
 
 Arrays are float32 and C-contiguous. The batch is the last axis of everything inside (activations
@@ -330,7 +330,7 @@ def critic_step(
     actions: Floats,
     targets: Floats,
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """A step on `fac.critic_loss`; targets [K, B]. Returns loss, gradient norm, mean of Q_1."""
+    """A step on `losses.critic_loss`; targets [K, B]. Returns loss, gradient norm, mean of Q_1."""
     inputs = _joined(observations, actions)
     memory = _memory(critics, len(inputs))
     values = forward(critics, inputs, memory)
@@ -373,7 +373,7 @@ def policy_step(
     cap: float,
     target_entropy: float,
 ) -> tuple[Floats, Floats, Floats, Floats, Scalar, Scalar, Scalar]:
-    """Steps on `fac.policy_loss` and `fac.temperature_loss`; the last critic is the constraint's.
+    """Steps on `policy_loss` and `temperature_loss` of `losses`; the last critic: the constraint's.
 
     Returns lambda(s), Q_phi(s, a) [B], the multiplier network's raw outputs [B] and hidden
     activations (for `multiplier_step`), policy loss, its gradient norm and the mean log-density.
@@ -435,7 +435,7 @@ def multiplier_step(
     cap: float,
     max_norm: float,
 ) -> float:
-    """A step on `fac.multiplier_loss`, its gradient clipped to ``max_norm``; returns its norm."""
+    """A step on `losses.multiplier_loss`, gradient clipped to ``max_norm``; returns its norm."""
     batch = len(raw)
     grad = np.empty((1, 1, batch), np.float32)
     for b in range(batch):

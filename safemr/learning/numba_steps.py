@@ -1,4 +1,4 @@
-"""The ``fused`` backend of the soft actor-critic family: its steps by compiled kernels.
+"""The numba backend (``fused``) of the soft actor-critic family: steps by compiled kernels.
 
 It owns no state. Networks, moments and step counts are the agent's own torch tensors, of which the
 kernels see the memory, so saving, resuming and target networks are those of the other backend.
@@ -43,7 +43,7 @@ def optimiser(adam: torch.optim.Adam) -> numba_kernels.Optimiser:
 
 
 class NumbaSteps(TorchSteps):
-    """`TorchSteps` without autograd: the same numbers up to the order of summation.
+    """`TorchSteps` with gradients written out: the same numbers up to the order of summation.
 
     Bound to the agent's tensors at the first step; an agent that exchanges them makes a new one.
     """

@@ -21,7 +21,7 @@ MEASURE_EVERY = 16
 
 
 class Trainer:
-    """Trains ``agent_type`` (the protocol of `safemr.algorithms.fac.Agent`).
+    """Trains ``agent_type`` (a `safemr.learning.soft_actor_critic.SoftActorCritic`).
 
     config: the algorithm's Config; make_envs: number of sub-environments -> batched environment;
     total_steps: environment steps of the whole run, which the learning-rate schedules span.

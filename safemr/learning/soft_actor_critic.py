@@ -71,7 +71,7 @@ class SoftActorCriticConfig(Hyperparameters):
     start_steps: int = 5_000  # random actions first, without learning
     start_hold: int = 10  # steps for which each of them is held
     device: str = "cpu"  # PyTorch's name of the device that learns
-    backend: Literal["fused", "torch"] = "fused"  # compiled kernels (CPU only), or autograd
+    backend: Literal["fused", "torch"] = "fused"  # numba's kernels (CPU only), or PyTorch
 
     RANGES: ClassVar[Mapping[str, str]] = {
         "constraint_scale": "[0.001, 1000]",

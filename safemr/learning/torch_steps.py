@@ -1,7 +1,7 @@
-"""The ``torch`` backend of the soft actor-critic family: steps by autograd.
+"""The torch backend of the soft actor-critic family: steps on the losses' derivatives by PyTorch.
 
 It is the definition of a step and works on every device; `safemr.learning.numba_steps` does the
-same without autograd and is tested against it.
+same by gradients that are written out and tested against it.
 """
 
 from __future__ import annotations

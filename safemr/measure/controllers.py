@@ -8,7 +8,6 @@ trained policy, so that they stand in the tables as ordinary entries. A learned 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -196,7 +195,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     scores.to_csv(options.out, index=False, lineterminator="\n")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -86,10 +86,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
             flush=True,
         )
     return 0
-
-
-if __name__ == "__main__":
-    from safemr.errors import reported_errors
-
-    with reported_errors():
-        raise SystemExit(main())

@@ -13,7 +13,7 @@ GEOMETRY = ("obstacle_size", "d_min", "goal_size", "extent", "solid_obstacles")
 
 
 def scene_at(data: Arrays, episode: int, step: int) -> SimpleNamespace:
-    """One moment of `rollouts.episodes`, with the attributes of the environment's own scene."""
+    """One moment of `trajectories.episodes`, with the attributes of the environment's own scene."""
     box = data["box"][step, episode]
     vase = data["vase"][step, episode] if "vase" in data else None
     return SimpleNamespace(

@@ -229,10 +229,3 @@ def _parser() -> argparse.ArgumentParser:
 def _share(share: float, count: int) -> str:
     """A share in per cent; none found in `count` states is not zero."""
     return f"{100 * share:.3f}%" if share else f"none of {count}"
-
-
-if __name__ == "__main__":
-    from safemr.errors import reported_errors
-
-    with reported_errors():
-        sys.exit(main())

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,8 +34,8 @@ def with_tables(document: Path) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """`python -m safemr.report.documents [--check] FILE...`."""
-    parser = argparse.ArgumentParser(prog="safemr.report.documents", description=__doc__)
+    """`safemr documents [--check] FILE...`."""
+    parser = argparse.ArgumentParser(prog="safemr documents", description=__doc__)
     parser.add_argument("documents", nargs="+", type=Path, metavar="FILE")
     parser.add_argument("--check", action="store_true", help="write nothing, report differences")
     options = parser.parse_args(arguments)
@@ -57,10 +56,3 @@ def _read(path: Path, otherwise: str) -> str:
         return path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): {otherwise}") from error
-
-
-if __name__ == "__main__":
-    from safemr.errors import reported_errors
-
-    with reported_errors():
-        sys.exit(main())

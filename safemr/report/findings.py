@@ -27,7 +27,7 @@ class Evidence:
     scores: score table of final evaluations (`statistics.final_scores`). progress: tidy table.
     expected: runs (task, variant, seed) that the configured grid asks for; without it, nothing
     counts as missing but what a rule needs and cannot find at all. points: variant -> (a, b).
-    aircraft: the comparison of `aircraft_evidence.compare`, of which variant (with phi_h for the
+    aircraft: the comparison of `scoring.compare`, of which variant (with phi_h for the
     handcrafted function), volume_ratio and missed_share are used. certificates: rows of
     `certify.certify`.
     """

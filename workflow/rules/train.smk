@@ -29,7 +29,7 @@ rule train:
     shell:
         "exec {sys.executable:q} -u -P -m safemr.experiment.train --resolved {params.resolved:q}"
         " --variant {params.variant:q} --root {params.root:q} --die-with-parent --wait"
-        # The mirror is no part of a run: what is not in `params` does not make it train again.
+        # The copy to wandb is no part of a run: what is not in `params` does not make it train again.
         " --wandb {CONFIG.wandb_mode:q} --wandb-project {CONFIG.wandb_project:q}"
         " >> {log:q} 2> >(trap '' HUP INT TERM; exec tee -a {log:q} >&2)"
 

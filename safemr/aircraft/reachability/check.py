@@ -170,7 +170,7 @@ def compare_all(references: list[Reference], cache: Path | None) -> Iterator[Com
 def main(arguments: list[str] | None = None) -> int:
     """The command line; returns the exit status."""
     parser = argparse.ArgumentParser(
-        prog="python -m safemr.aircraft.reachability.check",
+        prog="safemr slices",
         description="Compare the reachability solver with reference slices.",
     )
     parser.add_argument("file", type=Path, help="npz file of slices")
@@ -197,7 +197,3 @@ def main(arguments: list[str] | None = None) -> int:
     bounds = f"bounds: no disagreement where |V| > {MARGIN}, IoU at least {LEAST_IOU}"
     print(f"{'within' if passed else 'OUT OF'} bounds ({bounds}; arrays {', '.join(decisive)})")
     return 0 if passed else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -232,7 +232,7 @@ def certificate_check(
 
 
 def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
-    """lambda(s) as shades, phi = 0 as a line; data: `rollouts.multiplier_map`."""
+    """lambda(s) as shades, phi = 0 as a line; data: `trajectories.multiplier_map`."""
     top = max(float(np.nanmax(data["multiplier"])), 1e-3)
     shades = ListedColormap(1 - np.linspace(0, 1, 256)[:, None] * (1 - np.array([0.78, 0.26, 0.0])))
     image = ax.pcolormesh(data["x"], data["y"], data["multiplier"], cmap=shades, vmin=0, vmax=top,

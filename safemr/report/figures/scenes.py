@@ -39,9 +39,9 @@ def trajectories(
 ) -> Figure:
     """The first `steps` steps of each variant (rows) on the same layouts (columns).
 
-    recorded: variant -> `rollouts.episodes` with the same seeds. The path has the variant's colour;
-    crosses mark violating steps, small rings goals that were reached, and each panel states the
-    return collected. Without any recording the figure says so.
+    recorded: variant -> `trajectories.episodes` with the same seeds. The path has the variant's
+    colour; crosses mark violating steps, small rings goals that were reached, and each panel states
+    the return collected. Without any recording the figure says so.
     """
     if not recorded:
         return _nothing()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 from pathlib import Path
 
@@ -93,11 +92,6 @@ def test_impossible_numbers_end_in_one_line(arguments, capsys) -> None:
         cli.main(["evaluate", "somewhere", *arguments])
     assert end.value.code == 2
     assert capsys.readouterr().err.startswith("error: --episodes must be")
-
-
-@pytest.mark.parametrize("command", sorted(cli.COMMANDS))
-def test_every_command_exists(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert callable(importlib.import_module(cli.COMMANDS[command]).main)
 
 
 def score_table(**values: list[float]) -> pd.DataFrame:

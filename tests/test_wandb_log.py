@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from safemr.experiment.wandb_log import Mirror
+from safemr.experiment.wandb_log import WandbLog
 
+ROOT = Path(__file__).resolve().parents[1]
 CONFIG = {"task": {"name": "Pillars-0.15-Goal"}, "seed": 100}
 
 
@@ -44,13 +47,13 @@ def session(tmp_path):
 def run(session, monkeypatch, fails: str = "", mode: str = "offline") -> Wandb:
     wandb = Wandb(fails)
     monkeypatch.setitem(sys.modules, "wandb", wandb)
-    with Mirror(CONFIG, session, {"mode": mode, "project": "p"}) as mirror:
-        mirror.log({"step": 20.0, "eval_return": 1.5})
-        mirror.log({"step": 30.0, "eval_return": 2.5})
+    with WandbLog(CONFIG, session, {"mode": mode, "project": "p"}) as log:
+        log.log({"step": 20.0, "eval_return": 1.5})
+        log.log({"step": 30.0, "eval_return": 2.5})
     return wandb
 
 
-def test_rows_are_mirrored_grouped_by_task_and_algorithm(session, monkeypatch):
+def test_rows_are_copied_grouped_by_task_and_algorithm(session, monkeypatch):
     wandb = run(session, monkeypatch)
     names = [name for name, _ in wandb.calls]
     assert names == ["init", "log", "log", "log", "finish"]
@@ -72,3 +75,30 @@ def test_a_failure_is_told_once_and_stops_nothing(session, monkeypatch, capsys, 
 
 def test_disabled_never_touches_the_package(session, monkeypatch):
     assert run(session, monkeypatch, mode="disabled").calls == []
+
+
+@pytest.mark.parametrize("mode", ["online", "offline"])
+def test_a_missing_package_is_one_line_with_the_remedy(session, monkeypatch, capsys, mode):
+    monkeypatch.setitem(sys.modules, "wandb", None)  # as where it is not installed
+    with WandbLog(CONFIG, session, {"mode": mode, "project": "p"}) as log:
+        log.log({"step": 20.0})
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warning: wandb is off for this run: the package is missing")
+    assert 'pip install "safemr[wandb]"' in line
+
+
+def test_a_broken_package_is_not_called_missing(session, monkeypatch, tmp_path, capsys):
+    (tmp_path / "wandb.py").write_text("import a_module_that_nobody_has")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    with WandbLog(CONFIG, session, {"mode": "offline", "project": "p"}):
+        pass
+    assert "a_module_that_nobody_has" in capsys.readouterr().err
+
+
+def test_the_package_is_an_extra_and_the_pipeline_installs_it():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert not [need for need in project["dependencies"] if need.startswith("wandb")]
+    (need,) = project["optional-dependencies"]["wandb"]
+    assert need.startswith("wandb>=")
+    assert "\nwandb==" in (ROOT / "requirements.lock").read_text()

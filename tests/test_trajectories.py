@@ -1,4 +1,4 @@
-"""Rollout data: the episodes of the evaluation, and multiplier maps of a moving robot."""
+"""Recorded trajectories: the episodes of the evaluation, and multiplier maps of a moving robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled backend against autograd: same losses, same optimiser, same numbers."""
+"""The numba backend against the torch backend: same losses, same optimiser, same numbers."""
 
 from __future__ import annotations
 

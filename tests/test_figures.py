@@ -343,7 +343,7 @@ def test_animation_is_a_small_looping_gif(tmp_path):
         assert image.info["duration"] == 80
 
 
-def test_rollout_data_from_elsewhere_is_refused(tmp_path):
+def test_trajectories_from_elsewhere_are_refused(tmp_path):
     path = tmp_path / "bad.npz"
     path.write_bytes(b"nothing")
     with pytest.raises(UserError, match=r"bad\.npz"):
