@@ -28,6 +28,7 @@ import pytest
 from safemr import files
 from safemr.aircraft import neural, scoring
 from safemr.experiment import records
+from safemr.experiment.record import Record
 from safemr.measure import certify, controllers, evaluate, store, trajectories
 from safemr.measure.store import HEADER, Measurements
 
@@ -96,7 +97,10 @@ def the_rollouts(again: Again) -> None:
 def unseen_layouts(again: Again) -> None:
     inputs = again.kept("unseen_layouts", f"{TASK}-SafeMR-seed0")[1]["inputs"]
     evaluate.measured(
-        again.measurements, again.record(inputs), episodes=inputs["episodes"], seed=inputs["seed"]
+        again.measurements,
+        Record.open(again.record(inputs)),
+        episodes=inputs["episodes"],
+        seed=inputs["seed"],
     )
 
 
@@ -129,10 +133,10 @@ def neural_energies(again: Again) -> None:
 
     folders = sorted((again.record(policy) for policy in inputs["policies"]), key=place)
     runs, _ = records.read_records(again.root, [f.relative_to(again.root) for f in folders])
-    config = json.loads((folders[0] / records.CONFIG).read_text())
+    energy = Record.open(folders[0]).hyperparameters
     neural.measured(
         again.measurements, again.sets(inputs["log2_states"]), again.frontier(), again.root, runs,
-        config["algorithm"]["hyperparameters"],
+        energy,
     )  # fmt: skip
 
 

@@ -11,8 +11,9 @@ import pytest
 from sample_record import make_record
 
 from safemr.errors import UserError
+from safemr.experiment.record import Record
 from safemr.measure import store
-from safemr.measure.store import Measurements, record_inputs
+from safemr.measure.store import Measurements
 
 KIND = "controllers"
 
@@ -127,10 +128,10 @@ def test_a_failed_measurement_keeps_nothing(kept: Measurements) -> None:
 
 def test_a_record_is_identified_by_its_content(tmp_path: Path) -> None:
     folder = make_record(tmp_path)
-    inputs = record_inputs(folder)
+    inputs = Record.open(folder).inputs
     assert inputs["record"].endswith(folder.name)
     provenance = json.loads((folder / "provenance.json").read_text())
     assert inputs["files"] == provenance["files"]
     (folder / "progress.csv").write_text("step\n1\n")
     with pytest.raises(UserError, match="checksum"):
-        record_inputs(folder)
+        Record.open(folder)

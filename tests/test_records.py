@@ -20,8 +20,9 @@ from sample_record import CONFIG, POLICY, make_record
 from safemr import files
 from safemr.experiment import overview, records
 from safemr.experiment.checkpoints import RunSession
+from safemr.experiment.record import Record
 from safemr.experiment.records import RecordError
-from safemr.measure import certify, evaluate
+from safemr.measure import certify
 
 
 @pytest.fixture
@@ -190,7 +191,7 @@ def test_nothing_but_a_record_is_ever_advised_to_be_removed(record: Path, tmp_pa
     for kind, folder in foreign_folders(tmp_path, record).items():
         for read in (
             records.verify_record,
-            evaluate.evaluate_record,
+            Record.open,
             certify.certificate_of_record,
         ):
             with pytest.raises(RecordError) as caught:

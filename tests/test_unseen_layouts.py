@@ -14,6 +14,7 @@ from scipy import stats
 from safemr import cli
 from safemr.errors import UserError
 from safemr.experiment import records
+from safemr.experiment.record import Record
 from safemr.experiment.train import make_envs
 from safemr.learning import evaluation
 from safemr.learning.networks import StackedMLP
@@ -79,7 +80,7 @@ def test_a_record_without_a_policy_is_named(
 ) -> None:
     folder = make_record(tmp_path)
     with pytest.raises(UserError, match="not a policy"):
-        evaluate.evaluate_record(folder, episodes=1)
+        evaluate.evaluate_record(Record.open(folder), episodes=1)
     (folder / "policy.npz").unlink()
     scores = unseen_layouts.measured_scores(Measurements(tmp_path), [folder], episodes=1, seed=0)
     assert scores.empty

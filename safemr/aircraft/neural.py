@@ -29,11 +29,12 @@ from safemr.aircraft.unsafe_sets import Certificate, Truth
 from safemr.algorithms.neural_safemr import neural_energy
 from safemr.conventions import COVERS
 from safemr.experiment.planning import installed
+from safemr.experiment.record import Record
 from safemr.experiment.recorded_energy import NETWORK
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy, network_from_arrays
-from safemr.measure.store import VERSIONS, Measurements, record_inputs
+from safemr.measure.store import VERSIONS, Measurements
 from safemr.measure.tracks import below
 
 CONTROL = "fit to the truth"
@@ -99,7 +100,7 @@ def recorded_certificates(
     """Variant -> its certificates by seed, of the rows of `records.read_records`'s index."""
     found: dict[str, list[Certificate]] = {}
     for run, saved in learners(root, runs.sort_values("seed"), dynamics, ARRAYS):
-        certificate = recorded_certificate(dynamics, saved.policy())
+        certificate = recorded_certificate(dynamics, saved.record.policy())
         found.setdefault(str(run.variant), []).append(certificate)
     return found
 
@@ -197,7 +198,8 @@ def compare(
         | measured(recorded_certificate(dynamics, policy), saved.eta)
         | scoring.flights_of(policy, starts, truth)
         for run, saved, policy in (
-            (run, saved, saved.policy()) for run, saved in learners(root, runs, dynamics, ARRAYS)
+            (run, saved, saved.record.policy())
+            for run, saved in learners(root, runs, dynamics, ARRAYS)
         )
     ]
     covering = shifted_to_miss(truth, control, COVERS)
@@ -234,7 +236,7 @@ def measured(
     each variant; both kept among ``measurements``."""
     inputs: dict[str, Any] = {
         "task": installed(sets.task),
-        "policies": [record_inputs(root / str(folder)) for folder in sorted(runs["folder"])],
+        "policies": [Record.open(root / folder).inputs for folder in sorted(runs["folder"])],
         "energy": settings_of(energy), "log2_states": sets.log2_states,
         "flights": scoring.FLIGHTS, "solver": reachability.VERSION,
         "frontier": VERSIONS["aircraft_frontier"],

@@ -11,11 +11,10 @@ apply to a row is nan.
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,15 +31,12 @@ from safemr.certificates.energy import constraint
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
+from safemr.experiment.record import Record
 from safemr.experiment.recorded_energy import NETWORK, require_zeta
-from safemr.experiment.records import CONFIG
-from safemr.files import POLICY, policy_arrays
+from safemr.files import POLICY
 from safemr.learning.evaluation import Acts
-from safemr.measure.store import Measurements, record_inputs, record_label
+from safemr.measure.store import Measurements
 from safemr.tasks import Task, name_of
-
-if TYPE_CHECKING:
-    from safemr.learning.policies import Policy
 
 FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
 MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -178,13 +174,12 @@ def compare(
 
         def measure(saved: Saved = saved) -> dict[str, float]:
             own = _certificate(sets.truth, saved.zeta, saved.length_scale, saved.eta)
-            return own | flights_of(saved.policy(), sets.starts(flights), sets.truth)
+            return own | flights_of(saved.record.policy(), sets.starts(flights), sets.truth)
 
-        label = record_label(saved.folder)
-        inputs = {**shared, "policy": record_inputs(root / str(run.folder))}
+        inputs = {**shared, "policy": saved.record.inputs}
         rows.append(
             {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
-            | measurements.rows("aircraft_learners", label, inputs, measure)
+            | measurements.rows("aircraft_learners", saved.record.label, inputs, measure)
         )
     inputs = {**shared, "certificates": {name: list(zeta) for name, zeta in CERTIFICATES.items()}}
     rows += measurements.rows(
@@ -332,16 +327,10 @@ def flights_of(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
 class Saved:
     """What a record says of its certificate."""
 
-    folder: Path
+    record: Record
     zeta: NDArray[np.float64]  # [3] in units of length_scale
     length_scale: float  # [m]
     eta: float
-
-    def policy(self) -> Policy:
-        # torch, which kept measurements do not need
-        from safemr.learning.policies import load_policy
-
-        return load_policy(self.folder)
 
 
 def learners(
@@ -357,27 +346,23 @@ def learners(
     """
     found, lacking = [], []
     for run in runs.itertuples():
-        folder = root / str(run.folder)
-        if not (folder / POLICY).is_file():
-            lacking.append(str(run.folder))
-            continue
-        arrays = policy_arrays(folder / POLICY)
+        record = Record.open(root / str(run.folder))
+        arrays = record.policy_arrays() if record.has_policy else {}
         if not set(needed) <= arrays.keys():
             lacking.append(str(run.folder))
             continue
-        config = json.loads((folder / CONFIG).read_text())
-        if (flown := unsafe_sets.dynamics_of(config["task"])) != dynamics:
+        if (flown := unsafe_sets.dynamics_of(record.task)) != dynamics:
             raise UserError(
-                f"{folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe set is "
+                f"{record.folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe set is "
                 f"that of {dynamics.other_turns[0]:g}: compare it with that of its own task"
             )
         if NETWORK not in needed:
-            require_zeta(folder, config, arrays)
+            require_zeta(record.folder, record.config, arrays)
         saved = Saved(
-            folder=folder,
+            record=record,
             zeta=arrays["zeta"].astype(float),
             length_scale=float(arrays["length_scale"]),
-            eta=float(config["algorithm"]["hyperparameters"]["eta"]),
+            eta=float(record.hyperparameters["eta"]),
         )
         found.append((run, saved))
     if lacking:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from safemr.experiment.planning import Run
-from safemr.experiment.records import PROVENANCE, is_complete
+from safemr.experiment.record import Record
+from safemr.experiment.records import RecordError
+from safemr.tasks import name_of
 
 
 class Cost(NamedTuple):
@@ -22,10 +23,11 @@ class Cost(NamedTuple):
 
 def announced(root: Path, runs: Sequence[Run]) -> list[str]:
     """Lines about those of ``runs`` that have no record under ``root``; none when all have one."""
-    missing = [run for run in runs if not is_complete(root / run.path)]
+    opened = [(run, _opened(root / run.path)) for run in runs]
+    missing = [run for run, record in opened if record is None]
     if not missing:
         return []
-    known = list(_costs(root, (run for run in runs if run not in missing)))
+    known = list(_costs(record for _, record in opened if record is not None))
     seconds = [_estimate(run, known) for run in missing]
     estimated = sum(value for value in seconds if value is not None)
     unknown = sum(value is None for value in seconds)
@@ -45,15 +47,20 @@ def announced(root: Path, runs: Sequence[Run]) -> list[str]:
     return lines
 
 
-def _costs(root: Path, recorded: Iterable[Run]) -> Iterator[Cost]:
-    for run in recorded:
-        try:
-            seconds = float(json.loads((root / run.path / PROVENANCE).read_text())["cpu_s"])
-        except (OSError, ValueError, KeyError, TypeError):
+def _opened(folder: Path) -> Record | None:
+    try:
+        return Record.open(folder)
+    except RecordError:
+        return None
+
+
+def _costs(recorded: Iterable[Record]) -> Iterator[Cost]:
+    for record in recorded:
+        if (seconds := record.provenance.get("cpu_s")) is None:
             continue  # an outside record need not say it
-        algorithm = run.config["algorithm"]
-        names = frozenset(algorithm["hyperparameters"])
-        yield Cost(run.task, names, algorithm["name"], seconds / run.config["steps"])
+        names = frozenset(record.hyperparameters)
+        per_step = seconds / record.config["steps"]
+        yield Cost(name_of(record.task), names, record.algorithm, per_step)
 
 
 def _estimate(run: Run, known: Sequence[Cost]) -> float | None:

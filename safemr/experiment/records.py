@@ -1,4 +1,4 @@
-"""The record of one training run: what is written, how it is checked, how it is read.
+"""The record of one training run: what is written, and how it is checked.
 
 A record is a folder ``runs/<task>/<variant>/seed<n>-<digest>/`` with
 
@@ -8,7 +8,8 @@ A record is a folder ``runs/<task>/<variant>/seed<n>-<digest>/`` with
 ``provenance.json``  where the record comes from and the SHA-256 of the other files; written last
 
 so that a record is either complete or absent. Implementations outside this package write the same
-files with `write_record` (or by hand) and are held to the same `verify_record`.
+files with `write_record` (or by hand) and are held to the same `verify_record`. Whoever asks what a
+record says opens it (`safemr.experiment.record.Record`), or reads many as tables (`read_records`).
 """
 
 from __future__ import annotations
@@ -162,20 +163,23 @@ def verify_record(folder: Path) -> None:
     Raises:
         RecordError: one line with the folder, the fault and the command that repairs it.
     """
-    _verified(folder)
+    verified(folder)
 
 
 def is_complete(folder: Path) -> bool:
     """Whether ``folder`` holds a record that passes `verify_record`."""
     try:
-        _verified(folder)
+        verified(folder)
     except RecordError:
         return False
     return True
 
 
-def _verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, float]]]:
-    """The config, provenance and progress rows of a record that passed every check."""
+def verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[str, float]]]:
+    """The config, provenance and progress rows of a record that passed every check.
+
+    Raises RecordError as `verify_record`.
+    """
 
     _require_place(folder)
 
@@ -294,7 +298,7 @@ def read_records(
     index: list[dict[str, Any]] = []
     tables: list[pd.DataFrame] = []
     for folder in map(Path, folders):
-        config, provenance, rows = _verified(root / folder)
+        config, provenance, rows = verified(root / folder)
         key = {
             "task": config["task"]["name"],
             "variant": provenance["variant"],

@@ -10,7 +10,6 @@ each one that the paper prints.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,17 +24,10 @@ from safemr.certificates.energy import in_metres
 from safemr.certificates.feasibility import analytic_condition
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
+from safemr.experiment.record import Record
 from safemr.experiment.recorded_energy import require_zeta
-from safemr.experiment.records import (
-    CONFIG,
-    POLICY,
-    PROGRESS,
-    PROVENANCE,
-    parse_progress,
-    verify_record,
-)
 from safemr.measure.policy_check import check_policy
-from safemr.measure.store import Measurements, record_inputs, record_label
+from safemr.measure.store import Measurements
 from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
 
@@ -48,12 +40,12 @@ DEFAULT_STATES = 2**16
 
 @dataclass(frozen=True)
 class Certificate:
-    """A named energy function; `policy` is the record folder of a policy trained with it."""
+    """A named energy function; ``record`` is that of a run which ended with it and has a policy."""
 
     name: str
     zeta: Zeta
     eta: float = 0.0
-    policy: Path | None = None
+    record: Record | None = None
 
 
 def paper_certificates() -> list[Certificate]:
@@ -71,24 +63,20 @@ def paper_certificates() -> list[Certificate]:
 def certificate_of_record(folder: Path) -> tuple[Certificate, dict[str, Any]]:
     """The certificate a run ended with, and its task: the entry in the run's config.
 
-    The last logged sigma, k and n; `policy` is None where the record has none (it is optional).
+    The last logged sigma, k and n; `record` is None where it has no policy (which is optional).
     Raises UserError where there is no record, or none of the energy-function family, or where the
     energy function is more than its sigma, k and n.
     """
-    verify_record(folder)
-    config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-    last = parse_progress((folder / PROGRESS).read_text(encoding="utf-8"))[-1]
+    record = Record.open(folder)
+    last = record.rows[-1]
     if not last.keys() >= set(Zeta._fields):
         raise UserError(f"{folder}: its algorithm has no energy function to certify")
-    require_zeta(folder, config)
-    hyperparameters, task = config["algorithm"]["hyperparameters"], config["task"]
+    require_zeta(folder, record.config)
+    hyperparameters = record.hyperparameters
     scale = float(hyperparameters.get("length_scale", 1.0))
     zeta = Zeta(*in_metres([last[name] for name in Zeta._fields], scale))
     eta = float(hyperparameters.get("eta", 0.0)) * scale**zeta.n
-    variant = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))["variant"]
-    name = f"{variant} (seed {config['seed']})"
-    policy = folder if (folder / POLICY).exists() else None
-    return Certificate(name, zeta, eta, policy), dict(task)
+    return Certificate(record.name, zeta, eta, record if record.has_policy else None), record.task
 
 
 def certify(
@@ -118,11 +106,9 @@ def certify(
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
         "simulator_agrees": f"{search.confirmed}/{search.examined}",
     }  # fmt: skip
-    if certificate.policy is not None:
-        from safemr.learning.policies import load_policy
-
+    if certificate.record is not None:
         check = check_policy(
-            load_policy(certificate.policy), task, zeta, eta=eta, num_envs=episodes, seed=seed,
+            certificate.record.policy(), task, zeta, eta=eta, num_envs=episodes, seed=seed,
             limit=8 * episodes,
         )  # fmt: skip
         row |= {
@@ -146,7 +132,7 @@ def measured_certificate(
         "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
         "task": installed(task),
         "states": states, "episodes": episodes,
-        "policy": certificate.policy and record_inputs(certificate.policy),
+        "policy": certificate.record and certificate.record.inputs,
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
@@ -218,8 +204,8 @@ def example_titles(jobs: Sequence[tuple[Certificate, Task]]) -> list[str]:
 
 
 def _label(certificate: Certificate, task: Task) -> str:
-    if certificate.policy is not None:
-        return record_label(certificate.policy)
+    if certificate.record is not None:
+        return certificate.record.label
     return f"{certificate.name} {name_of(task)}"
 
 

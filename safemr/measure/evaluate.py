@@ -6,36 +6,31 @@ safemr evaluate results/runs/Pillars-0.15-Goal/SafeMR/seed0-* --episodes 100 --s
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from safemr.conventions import UNSEEN_SEED
 from safemr.errors import UserError
-from safemr.experiment.records import CONFIG, verify_record
+from safemr.experiment.record import Record
 from safemr.learning.evaluation import play
-from safemr.measure.store import Measurements, record_inputs, record_label
+from safemr.measure.store import Measurements
 from safemr.tasks import make_envs
 
 EPISODES = 100
 
 
 def evaluate_record(
-    folder: Path, *, episodes: int = EPISODES, seed: int = UNSEEN_SEED, deterministic: bool = True
+    record: Record, *, episodes: int = EPISODES, seed: int = UNSEEN_SEED, deterministic: bool = True
 ) -> dict[str, float]:
     """A record's final policy on ``episodes`` layouts of its task: `evaluate`, and ``return_sd``.
 
     ``return_sd`` is the standard deviation of the return over the layouts (nan for one).
 
     Raises:
-        UserError: the record is damaged or has no policy.
+        UserError: the record has no policy.
     """
-    from safemr.learning.policies import load_policy  # torch
-
-    verify_record(folder)
-    policy = load_policy(folder)
-    task = json.loads((folder / CONFIG).read_text(encoding="utf-8"))["task"]
-    envs = make_envs(task, episodes)
+    policy = record.policy()
+    envs = make_envs(record.task, episodes)
     try:
         played = play(policy, envs, seed, deterministic)
     finally:
@@ -48,15 +43,15 @@ def evaluate_record(
 
 
 def measured(
-    measurements: Measurements, folder: Path, *, episodes: int, seed: int
+    measurements: Measurements, record: Record, *, episodes: int, seed: int
 ) -> Mapping[str, float]:
     """`evaluate_record`, kept among ``measurements``."""
-    inputs = {**record_inputs(folder), "episodes": episodes, "seed": seed}
+    inputs = {**record.inputs, "episodes": episodes, "seed": seed}
     return measurements.rows(
         "unseen_layouts",
-        record_label(folder),
+        record.label,
         inputs,
-        lambda: evaluate_record(folder, episodes=episodes, seed=seed),
+        lambda: evaluate_record(record, episodes=episodes, seed=seed),
     )
 
 
@@ -74,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError("--episodes must be 1 or more, and --seed 0 or more")
     for folder in options.records:
         found = evaluate_record(
-            folder,
+            Record.open(folder),
             episodes=options.episodes,
             seed=options.seed,
             deterministic=not options.exploring,

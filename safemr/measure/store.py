@@ -4,7 +4,7 @@ Flying ten thousand encounters or searching a certificate takes seconds to minut
 same numbers every time. `kept` stores such a result in
 ``<results root>/measurements/<kind>/<label>-<key>``, where the key is a digest of everything the
 result depends on: the kind, its version, and the caller's inputs, among them the checksums of the
-records (`record_inputs`). What is stored under another key of the same label was superseded and is
+records (`Record.inputs`). What is stored under another key of the same label was superseded and is
 removed. Deleting the folder measures everything anew.
 
 Rows of numbers are kept as JSON, arrays as npz without pickles.
@@ -45,22 +45,6 @@ VERSIONS = {
 }
 
 T = TypeVar("T")
-
-
-def record_label(folder: Path) -> str:
-    """A record's name among measurements: task, variant, seed and digest."""
-    return " ".join(folder.parts[-3:])
-
-
-def record_inputs(folder: Path) -> dict[str, Any]:
-    """What identifies a verified record's content: its last two folders and its checksums.
-
-    Raises:
-        RecordError: the record must not be believed.
-    """
-    records.verify_record(folder)
-    provenance = json.loads((folder / records.PROVENANCE).read_text(encoding="utf-8"))
-    return {"record": "/".join(folder.parts[-3:]), "files": provenance["files"]}
 
 
 class Measurements:

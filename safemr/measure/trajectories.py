@@ -18,7 +18,7 @@ from safemr.errors import UserError
 from safemr.experiment.planning import installed
 from safemr.files import Arrays
 from safemr.learning.evaluation import Acts
-from safemr.measure.store import Measurements, record_inputs, record_label
+from safemr.measure.store import Measurements
 from safemr.measure.tracks import GEOMETRY
 from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
@@ -152,25 +152,23 @@ def measured(
 
     Their arrays under "episodes/" and "map/", kept among ``measurements``.
     """
-    assert certificate.policy is not None
+    record = certificate.record
+    assert record is not None
     inputs = {
-        "policy": record_inputs(certificate.policy), "zeta": list(certificate.zeta),
+        "policy": record.inputs, "zeta": list(certificate.zeta),
         "task": installed(task),
         "layouts": layouts, "steps": steps,
     }  # fmt: skip
 
     def measure() -> Arrays:
-        from safemr.learning.policies import load_policy
-
-        assert certificate.policy is not None
-        policy = load_policy(certificate.policy)
+        policy = record.policy()
         parts = {
             "episodes": episodes(policy, task, seeds=layouts, steps=steps),
             "map": multiplier_map(policy, certificate.zeta, task, seed=layouts[0]),
         }
         return {f"{part}/{name}": x for part, made in parts.items() for name, x in made.items()}
 
-    return measurements.arrays("rollouts", record_label(certificate.policy), inputs, measure)
+    return measurements.arrays("rollouts", record.label, inputs, measure)
 
 
 def _pose(values: NDArray[Any] | None) -> NDArray[Any]:

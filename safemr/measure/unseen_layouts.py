@@ -6,16 +6,16 @@ nothing of other layouts. Here every final policy flies the same larger set, onc
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
 
-from safemr.experiment import records
+from safemr.experiment.record import Record
 from safemr.measure import evaluate
 from safemr.measure.controllers import SCORE_COLUMNS
 from safemr.measure.store import Measurements
+from safemr.tasks import name_of
 
 
 def measured_scores(
@@ -28,12 +28,11 @@ def measured_scores(
     """
     rows = []
     for folder in folders:
-        if not (folder / records.POLICY).exists():
+        record = Record.open(folder)
+        if not record.has_policy:
             print(f"no policy in {folder}")
             continue
-        found = evaluate.measured(measurements, folder, episodes=episodes, seed=seed)
-        config = json.loads((folder / records.CONFIG).read_text(encoding="utf-8"))
-        provenance = json.loads((folder / records.PROVENANCE).read_text(encoding="utf-8"))
-        name = (config["task"]["name"], provenance["variant"], config["seed"])
+        found = evaluate.measured(measurements, record, episodes=episodes, seed=seed)
+        name = (name_of(record.task), record.variant, record.seed)
         rows += [(*name, f"eval_{metric}", value) for metric, value in found.items()]
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)

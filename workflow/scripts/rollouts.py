@@ -14,7 +14,7 @@ arrays = {}
 with reported_errors():
     for variant, folder in params.folders.items():
         certificate, entry = certificate_of_record(Path(params.root, folder))
-        if certificate.policy is None:
+        if certificate.record is None:
             print(f"no policy in {folder}")
             continue
         made = trajectories.measured(

@@ -1,0 +1,93 @@
+"""A record that was opened: verified once, and then the one answer to what a run was and became."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from safemr.experiment import records
+from safemr.files import POLICY, Arrays, policy_arrays
+
+if TYPE_CHECKING:
+    from safemr.learning.policies import Policy
+
+
+@dataclass(frozen=True)
+class Record:
+    """A verified record; made by `Record.open`."""
+
+    folder: Path
+    config: Mapping[str, Any]  # the resolved configuration of the run
+    provenance: Mapping[str, Any]
+    rows: Sequence[records.Row]  # of progress.csv, the last one being the end of training
+
+    @classmethod
+    def open(cls, folder: Path | str) -> Record:
+        """The record in ``folder``.
+
+        Raises:
+            RecordError: as `safemr.experiment.records.verify_record`.
+        """
+        return cls(Path(folder), *records.verified(Path(folder)))
+
+    @property
+    def variant(self) -> str:
+        """The label under which figures and tables show the run."""
+        return self.provenance["variant"]
+
+    @property
+    def task(self) -> dict[str, Any]:
+        """The task's entry in the configuration, from which `safemr.tasks` makes it."""
+        return dict(self.config["task"])
+
+    @property
+    def seed(self) -> int:
+        return self.config["seed"]
+
+    @property
+    def algorithm(self) -> str:
+        return self.config["algorithm"]["name"]
+
+    @property
+    def hyperparameters(self) -> Mapping[str, Any]:
+        return self.config["algorithm"].get("hyperparameters", {})
+
+    @property
+    def name(self) -> str:
+        """The run among others of its task: ``SafeMR (seed 0)``."""
+        return f"{self.variant} (seed {self.seed})"
+
+    @property
+    def label(self) -> str:
+        """Its name among measurements: task, variant, seed and digest."""
+        return " ".join(self.folder.parts[-3:])
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """What identifies its content: its last three folders and its checksums."""
+        return {"record": "/".join(self.folder.parts[-3:]), "files": self.provenance["files"]}
+
+    @property
+    def has_policy(self) -> bool:
+        """Whether it holds the trained policy, which is optional."""
+        return (self.folder / POLICY).is_file()
+
+    def policy_arrays(self) -> Arrays:
+        """The arrays of its policy file, read when first asked for.
+
+        Raises UserError where it has none.
+        """
+        return self._policy_arrays
+
+    @functools.cached_property
+    def _policy_arrays(self) -> Arrays:
+        return policy_arrays(self.folder / POLICY)
+
+    def policy(self) -> Policy:
+        """Its trained policy. Raises UserError where it has none that can act."""
+        from safemr.learning.policies import load_policy  # torch, seconds
+
+        return load_policy(self.folder)
