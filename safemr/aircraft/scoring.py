@@ -353,8 +353,8 @@ def learners(
             continue
         if (flown := unsafe_sets.dynamics_of(record.task)) != dynamics:
             raise UserError(
-                f"{record.folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe set "
-                f"is that of {dynamics.other_turns[0]:g}: compare it with that of its own task"
+                f"{record.folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe "
+                f"set is that of {dynamics.other_turns[0]:g}: compare it with that of its own task"
             )
         if NETWORK not in needed:
             require_zeta(record.folder, record.config, arrays)
