@@ -270,7 +270,12 @@ def test_slices_hold_the_sets_of_the_comparison(
     comparison: pd.DataFrame, sets: TrueSets, tmp_path: Path
 ) -> None:
     x, y, (cut,) = scoring.slices(
-        sets, comparison, Measurements(tmp_path), degrees=[180], spacing=0.5
+        sets,
+        comparison,
+        Measurements(tmp_path),
+        degrees=[180],
+        spacing=0.5,
+        handcrafted=["FAC-phih"],
     )
     assert set(cut.learned) == {"SafeMR", "JointSIS"}
     assert len(cut.learned["SafeMR"]) == 2
