@@ -253,7 +253,7 @@ def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
 
 
 def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
-    figure = pictures.frontier(FRONTIER, comparison, COVERS)
+    figure = pictures.frontier(FRONTIER, comparison, COVERS, handcrafted=["FAC-phih"])
     (ax,) = figure.axes
     shown = {
         to_hex(line.get_color()): line.get_xydata()
