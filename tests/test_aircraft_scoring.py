@@ -253,7 +253,7 @@ def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
 
 
 def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
-    figure = pictures.frontier(FRONTIER, comparison, COVERS)
+    figure = pictures.frontier(FRONTIER, comparison, COVERS, handcrafted=["FAC-phih"])
     (ax,) = figure.axes
     shown = {
         to_hex(line.get_color()): line.get_xydata()
@@ -270,7 +270,12 @@ def test_slices_hold_the_sets_of_the_comparison(
     comparison: pd.DataFrame, sets: TrueSets, tmp_path: Path
 ) -> None:
     x, y, (cut,) = scoring.slices(
-        sets, comparison, Measurements(tmp_path), degrees=[180], spacing=0.5
+        sets,
+        comparison,
+        Measurements(tmp_path),
+        degrees=[180],
+        spacing=0.5,
+        handcrafted=["FAC-phih"],
     )
     assert set(cut.learned) == {"SafeMR", "JointSIS"}
     assert len(cut.learned["SafeMR"]) == 2

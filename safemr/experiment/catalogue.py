@@ -10,14 +10,21 @@ import math
 import pkgutil
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from safemr.environments import register_tasks
 from safemr.errors import UserError, show
-from safemr.experiment.config import FAMILIES
-from safemr.experiment.roles import BASELINE, CERTIFICATES, NO_CERTIFICATE, ROLES
+from safemr.experiment.config import FAMILIES, Variant
+from safemr.experiment.roles import (
+    BASELINE,
+    CERTIFICATES,
+    NO_CERTIFICATE,
+    OUTSIDE,
+    ROLES,
+    Variants,
+)
 from safemr.learning.hyperparameters import unused
 from safemr.names import unknown
 
@@ -71,6 +78,18 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
         if said[part] not in known:
             raise UserError(f"{file}: {part} must be one of {', '.join(known)}")
     return Algorithm(name, module.VERSION, family, module.Config, module.Trainer, *said.values())
+
+
+def variants_of(entries: Mapping[str, Variant], outside: Iterable[str] = ()) -> Variants:
+    """Role and certificate of entries of ``algorithms``, and those of `outside` behind them."""
+    algorithms = {label: load_algorithm(entry.algorithm) for label, entry in entries.items()}
+    others = list(outside)
+    return Variants(
+        {label: entries[label].role or algorithm.role for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, OUTSIDE),
+        {label: algorithm.certificate for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, NO_CERTIFICATE),
+    )
 
 
 def hyperparameters(

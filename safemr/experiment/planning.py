@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,10 @@ from typing import Any
 from safemr import environments, paper
 from safemr.errors import UserError, show
 from safemr.experiment import records
-from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorithm
+from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorithm, variants_of
 from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
-from safemr.experiment.roles import NO_CERTIFICATE, OUTSIDE, Variants
+from safemr.experiment.roles import Variants
 from safemr.learning.hyperparameters import Setting
 from safemr.names import unknown
 from safemr.tasks import (
@@ -287,18 +287,6 @@ def resolve(config: Config) -> Plan:
     )
     _check_distinct(plan)
     return plan
-
-
-def variants_of(entries: Mapping[str, Variant], outside: Iterable[str] = ()) -> Variants:
-    """Role and certificate of entries of ``algorithms``, and those of `outside` behind them."""
-    algorithms = {label: load_algorithm(entry.algorithm) for label, entry in entries.items()}
-    others = list(outside)
-    return Variants(
-        {label: entries[label].role or algorithm.role for label, algorithm in algorithms.items()}
-        | dict.fromkeys(others, OUTSIDE),
-        {label: algorithm.certificate for label, algorithm in algorithms.items()}
-        | dict.fromkeys(others, NO_CERTIFICATE),
-    )
 
 
 class _Resolver:
