@@ -160,7 +160,7 @@ def repository(
         (root / "requirements.lock").write_text("numpy\n")
         monkeypatch.setattr(make, "ROOT", root)
         monkeypatch.setattr(make, "LOCK", root / "requirements.lock")
-        monkeypatch.setattr(make, "create", lambda folder: folder.mkdir(parents=True))
+        monkeypatch.setattr(make, "create", lambda folder: None)
         monkeypatch.setattr(make, "pip", lambda *arguments: "")
         return root
 
@@ -315,3 +315,21 @@ def test_packages_are_installed_into_the_environment_alone(
     assert "PIP_PROXY=http://proxy:3" in lines
     assert "PIP_USER=0" in lines
     assert not {line.partition("=")[0] for line in lines} & set(misleading)
+
+
+def test_the_lock_holds_what_the_pipeline_and_the_tests_need_extras_included(
+    make: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+
+    def pip(folder: Path, *arguments: str) -> str:
+        asked.extend(arguments)
+        return "numpy==2.0.0+local\ntriton==3.0\n"
+
+    monkeypatch.setattr(make, "create", lambda folder: None)
+    monkeypatch.setattr(make, "pip", pip)
+    monkeypatch.setattr(make, "LOCK", tmp_path / "requirements.lock")
+    assert make.main(["lock"]) == 0
+    for package in ("numpy", "pytest", "wandb", "setuptools"):
+        assert any(need.startswith(f"{package}>=") for need in asked), package
+    assert make.LOCK.read_text() == make.HEADER + "numpy==2.0.0\n"
