@@ -115,7 +115,7 @@ def check_envs(envs: Any) -> None:
             raise UserError(f"{type(envs).__name__}: {what}; {remedy}")
 
     def count(name: str, remedy: str) -> int:
-        value = getattr(envs, name, None)
+        value: Any = getattr(envs, name, None)
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         require(whole and value >= 1, f"{name} is {_seen(envs, name)}", remedy)
         return int(value)
@@ -183,6 +183,7 @@ def check_envs(envs: Any) -> None:
             shape = (n, m) if name in ("d", "d_dot") else (n,)
             array(infos[name], f"{where}: infos[{name!r}]", shape)
 
+    result: Any
     try:
         result = envs.reset(seed=0)
     except TypeError as error:
