@@ -224,7 +224,7 @@ def _seen(envs: Any, name: str) -> str:
 def _columns(envs: Any, name: str) -> int:
     """The columns of a one-dimensional Box, 0 for anything else."""
     space = getattr(envs, name, None)
-    shape = getattr(space, "shape", None) or ()
+    shape: tuple[int, ...] = getattr(space, "shape", None) or ()
     return int(shape[0]) if len(shape) == 1 and hasattr(space, "low") else 0
 
 
