@@ -115,7 +115,7 @@ def check_envs(envs: Any) -> None:
             raise UserError(f"{type(envs).__name__}: {what}; {remedy}")
 
     def count(name: str, remedy: str) -> int:
-        value = getattr(envs, name, None)
+        value: Any = getattr(envs, name, None)
         whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
         require(whole and value >= 1, f"{name} is {_seen(envs, name)}", remedy)
         return int(value)
@@ -183,6 +183,7 @@ def check_envs(envs: Any) -> None:
             shape = (n, m) if name in ("d", "d_dot") else (n,)
             array(infos[name], f"{where}: infos[{name!r}]", shape)
 
+    result: Any
     try:
         result = envs.reset(seed=0)
     except TypeError as error:
@@ -223,7 +224,7 @@ def _seen(envs: Any, name: str) -> str:
 def _columns(envs: Any, name: str) -> int:
     """The columns of a one-dimensional Box, 0 for anything else."""
     space = getattr(envs, name, None)
-    shape = getattr(space, "shape", None) or ()
+    shape: tuple[int, ...] = getattr(space, "shape", None) or ()
     return int(shape[0]) if len(shape) == 1 and hasattr(space, "low") else 0
 
 
