@@ -41,6 +41,7 @@ from safemr.learning.replay import Batch
 from safemr.learning.soft_actor_critic import SoftActorCritic, SoftActorCriticConfig
 
 VERSION = 1
+CERTIFICATE = "energy"
 
 
 @dataclass(frozen=True)

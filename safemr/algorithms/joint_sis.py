@@ -31,6 +31,7 @@ from safemr.learning.losses import Info
 from safemr.learning.replay import Batch
 
 VERSION = 1
+CERTIFICATE = "energy"
 
 
 @dataclass(frozen=True)

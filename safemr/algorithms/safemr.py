@@ -21,6 +21,7 @@ from safemr.certificates import energy
 from safemr.learning.replay import Batch
 
 VERSION = 1
+CERTIFICATE = "energy"
 
 
 @dataclass(frozen=True)

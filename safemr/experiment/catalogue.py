@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import functools
 import importlib
+import importlib.util
 import math
 import pkgutil
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from safemr.certificates.certificate import FAMILIES as CERTIFICATES
+from safemr.certificates.certificate import Certificate, family_named
 from safemr.environments import register_tasks
 from safemr.errors import UserError, show
 from safemr.experiment.config import FAMILIES
@@ -30,6 +35,7 @@ class Algorithm:
     family: str
     hyperparameters: type[Any]  # the frozen dataclass ``Config``
     trainer: type[Any]
+    certificate: str | None  # the family of its energy functions, None without any
 
     @property
     def settable(self) -> set[str]:
@@ -49,20 +55,70 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
     """Import an algorithm by name and check the module's contract."""
     if name not in algorithm_names():
         raise unknown("algorithm", name, algorithm_names(), where)
-    register_tasks()  # an algorithm may import from that package
-    file = f"safemr/algorithms/{name}.py"
-    try:
-        module = importlib.import_module(f"safemr.algorithms.{name}")
-    except Exception as error:  # whatever is wrong in that file, its author wants to know where
-        reason = str(error).partition("\n")[0]
-        raise UserError(f"{file} does not import: {type(error).__name__}: {reason}") from error
+    file, module = f"safemr/algorithms/{name}.py", _imported(name)
     for part in ("VERSION", "Config", "Trainer"):
         if not hasattr(module, part):
             raise UserError(f"{file} must define {part}")
     family = getattr(module.Trainer, "family", None)
     if family not in FAMILIES:
         raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
-    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer)
+    certificate = declared_certificate(name)
+    if certificate != getattr(module, "CERTIFICATE", None):
+        raise UserError(f'{file}: write CERTIFICATE = "<name>", a text that can be read as it is')
+    if certificate is not None:
+        try:
+            certificate_family(certificate)
+        except UserError as error:
+            raise UserError(f"{file}: {error}") from error
+    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer, certificate)
+
+
+def _imported(name: str) -> Any:
+    """The module of an algorithm that exists."""
+    register_tasks()  # an algorithm may import from that package
+    try:
+        return importlib.import_module(f"safemr.algorithms.{name}")
+    except Exception as error:  # whatever is wrong in that file, its author wants to know where
+        reason = str(error).partition("\n")[0]
+        raise UserError(
+            f"safemr/algorithms/{name}.py does not import: {type(error).__name__}: {reason}"
+        ) from error
+
+
+@functools.cache
+def declared_certificate(name: str) -> str | None:
+    """The family of an algorithm's certificates, ``CERTIFICATE = "..."`` in its file, or None.
+
+    It is read, not imported: readers of records and a dry run need no torch for it. Raises
+    UserError for an unknown algorithm.
+    """
+    if name not in algorithm_names():
+        raise unknown("algorithm", name, algorithm_names())
+    spec = importlib.util.find_spec(f"safemr.algorithms.{name}")
+    if spec is None or spec.origin is None:
+        return None
+    with contextlib.suppress(SyntaxError):  # importing it says more of what is wrong
+        for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+            if (
+                isinstance(node, ast.Assign)
+                and ast.unparse(node.targets[0]) == "CERTIFICATE"
+                and isinstance(node.value, ast.Constant)
+            ):
+                return node.value.value
+    return None
+
+
+def certificate_family(name: str) -> type[Certificate]:
+    """The class of a family, which an algorithm that declares it makes known by being imported.
+
+    Raises UserError for one that there is not.
+    """
+    for algorithm in algorithm_names():
+        if name in CERTIFICATES:
+            break
+        if declared_certificate(algorithm) == name:
+            _imported(algorithm)
+    return family_named(name)
 
 
 def hyperparameters(

@@ -1,10 +1,14 @@
 # The aircraft experiment: its learners are runs of the one training rule. The solved truth is kept
 # in <results root>/.work/aircraft, which no record needs and a clone solves again (15 s).
-from safemr.experiment.recorded_energy import NEURAL as NEURAL_NAMES
+from safemr.experiment.catalogue import declared_certificate
 
 # Those with a neural energy function have a table and a figure of their own, and are made when
 # aircraft.algorithms has any.
-NEURAL_PLAN = [run for run in PLAN.aircraft if run.config["algorithm"]["name"] in NEURAL_NAMES]
+NEURAL_PLAN = [
+    run
+    for run in PLAN.aircraft
+    if declared_certificate(run.config["algorithm"]["name"]) == "neural"
+]
 AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
 AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]
 NEURAL = [run for run in NEURAL_PLAN if run in RECORDED]
