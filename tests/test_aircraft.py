@@ -195,7 +195,7 @@ def test_known_certificates(
     infeasible_eta: float,
     leak: float,
 ):
-    metrics = unsafe_sets.compare_certificate(truth, unsafe_sets.energy_certificate(CONSTANT, zeta))
+    metrics = unsafe_sets.compare_certificate(truth, unsafe_sets.energy_of(CONSTANT, zeta))
     assert metrics.volume_ratio == pytest.approx(ratio, abs=0.02)
     assert metrics.iou == pytest.approx(iou, abs=0.008)
     assert metrics.missed_share == pytest.approx(missed, abs=0.015)
@@ -239,7 +239,7 @@ def test_frontier_is_at_least_as_good_as_a_random_search(
     (point,) = unsafe_sets.frontier(truth, [missed], box)
     assert published - better <= point.volume_ratio <= published + 0.01
     metrics = unsafe_sets.compare_certificate(
-        truth, unsafe_sets.energy_certificate(CONSTANT, point.zeta), turns=1
+        truth, unsafe_sets.energy_of(CONSTANT, point.zeta), turns=1
     )
     assert metrics.volume_ratio == pytest.approx(point.volume_ratio, abs=1e-3)
     assert metrics.missed_share <= missed + 1e-3
@@ -257,7 +257,7 @@ def test_frontier_is_not_beaten_by_random_parameters(truth: unsafe_sets.Truth):
             np.exp(generator.uniform(*np.log(box.k))),
             generator.uniform(*box.n),
         )
-        claimed = (unsafe_sets.energy_certificate(CONSTANT, zeta)(truth.states) > 0) | truth.disc
+        claimed = (unsafe_sets.energy_of(CONSTANT, zeta)(truth.states) > 0) | truth.disc
         missed = np.mean(~claimed[truth.unsafe & ~truth.disc])
         ratio = claimed.sum() / truth.unsafe.sum()
         found = np.where(missed <= shares, np.minimum(found, ratio), found)
@@ -284,7 +284,7 @@ def test_no_energy_function_is_feasible_dead_ahead(
     d: float, psi: float, k: float, n: float, a: float
 ):
     """On y = 0 phi rises at a rate in which the turn rate does not appear."""
-    phi = unsafe_sets.energy_certificate(CONSTANT, (0.3, k, n))
+    phi = unsafe_sets.energy_of(CONSTANT, (0.3, k, n))
     state, h = np.array([d, 0.0, psi]), 1e-6
     rise = (phi(CONSTANT.flow(state, a, 1.0, h)) - phi(CONSTANT.flow(state, a, 1.0, -h))) / (2 * h)
     expected = 5 * n * d ** (n - 1) * (1 - np.cos(psi))
@@ -299,8 +299,8 @@ def test_zeta_in_other_length_units_means_the_same_set(
     sigma: float, k: float, n: float, length: float
 ):
     states = np.random.default_rng(0).uniform([-6, -10, 0], [20, 10, 6.28], (500, 3))
-    scaled = unsafe_sets.energy_certificate(CONSTANT, (sigma, k, n), length)(states)
-    metres = unsafe_sets.energy_certificate(CONSTANT, in_metres((sigma, k, n), length))(states)
+    scaled = unsafe_sets.energy_of(CONSTANT, (sigma, k, n), length)(states)
+    metres = unsafe_sets.energy_of(CONSTANT, in_metres((sigma, k, n), length))(states)
     np.testing.assert_allclose(scaled * length**n, metres, rtol=1e-9, atol=1e-9)
 
 

@@ -144,7 +144,7 @@ def test_rows_hold_what_the_measures_say(
     comparison: pd.DataFrame, truth: unsafe_sets.Truth
 ) -> None:
     row = comparison[(comparison["variant"] == "JointSIS") & (comparison["seed"] == 101)].iloc[0]
-    phi = unsafe_sets.energy_certificate(CONSTANT, np.float32(ZETAS["JointSIS", 101]).tolist(), 5.0)
+    phi = unsafe_sets.energy_of(CONSTANT, np.float32(ZETAS["JointSIS", 101]).tolist(), 5.0)
     expected = unsafe_sets.compare_certificate(truth, phi, eta=0.01)
     for metric in scoring.COLUMNS:
         assert row[metric] == getattr(expected, metric)

@@ -14,6 +14,7 @@ from sample_record import CONFIG, ROWS
 
 from safemr import paper
 from safemr.certificates import falsification
+from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.energy import energy
 from safemr.certificates.falsification import ROBOT
 from safemr.certificates.feasibility import analytic_condition, radial_requirement
@@ -275,7 +276,7 @@ def record_on(root: Path, task: dict[str, Any], algorithm: str = "fac", **arrays
 
 def test_the_search_covers_the_distances_of_the_settings():
     """With obstacles of 0.3 m the robot's centre must stay 0.4 m away: no state is nearer."""
-    certificate = certify.Certificate("mine", Zeta(0.2, 0.8, 2.1))
+    certificate = EnergyCertificate("mine", Zeta(0.2, 0.8, 2.1))
     (_, plain), (row, search) = (
         certify.certify(certificate, task, states=256) for task in (TASK, LARGE)
     )
@@ -347,7 +348,7 @@ def test_the_examples_that_the_repository_keeps_come_out_as_they_say(capsys):
 
 def test_kept_measurements_of_other_settings_are_others(tmp_path):
     kept = Measurements(tmp_path)
-    certificate = certify.Certificate("mine", Zeta(0.2, 0.8, 2.1))
+    certificate = EnergyCertificate("mine", Zeta(0.2, 0.8, 2.1))
     plain = {"name": TASK, "version": 1, "settings": {}}
     rows, maps = [], []
     for task in (plain, LARGE, {**LARGE, "name": "Larger", "settings": {"obstacle_size": 0.4}}):
@@ -361,7 +362,7 @@ def test_kept_measurements_of_other_settings_are_others(tmp_path):
 
 
 def test_equal_titles_are_numbered_so_that_no_example_is_lost():
-    jobs = [(certify.Certificate("a", Zeta(0, 0, 1)), task) for task in (TASK, LARGE, TASK, TASK)]
+    jobs = [(EnergyCertificate("a", Zeta(0, 0, 1)), task) for task in (TASK, LARGE, TASK, TASK)]
     titles = certify.example_titles(jobs)
     assert titles == [f"a on {TASK}", "a on Large", f"a on {TASK}, 2", f"a on {TASK}, 3"]
 

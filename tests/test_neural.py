@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from sample_record import make_record
 
 from envs.aircraft import AircraftVectorEnv, observe
 from safemr.aircraft import neural, unsafe_sets
@@ -44,10 +45,12 @@ def states(count: int = 500) -> np.ndarray:
     return drawn
 
 
-def certificate(made: neural_safemr.Trainer) -> unsafe_sets.Certificate:
+def certificate(made: neural_safemr.Trainer) -> unsafe_sets.Energy:
     """As it is read from a policy file."""
     policy = Policy.from_arrays(made.policy.arrays())
-    return neural.recorded_certificate(CONSTANT, policy)
+    return unsafe_sets.of_states(
+        CONSTANT, neural_safemr.NeuralCertificate.from_policy(policy, "one")
+    )
 
 
 def filled(made: neural_safemr.Trainer, scale: float = 3.0) -> neural_safemr.Trainer:
@@ -93,7 +96,7 @@ def test_corrected_energy_is_a_soft_maximum_above_phi_0(phi, contact, correction
 
 def test_learning_starts_from_the_handcrafted_energy():
     made = trainer(smoothing=1e-3)
-    expected = unsafe_sets.energy_certificate(CONSTANT, (0.06, 1.0, 1.0), 5.0)(states())
+    expected = unsafe_sets.energy_of(CONSTANT, (0.06, 1.0, 1.0), 5.0)(states())
     contact = 1.0 - CONSTANT.separation(states()) / 5.0
     found = certificate(made)(states())
     np.testing.assert_allclose(found, np.maximum(expected, contact), atol=1e-3)
@@ -203,7 +206,7 @@ def truth(solution: Solution) -> unsafe_sets.Truth:
 
 
 @pytest.fixture(scope="module")
-def control(truth: unsafe_sets.Truth) -> unsafe_sets.Certificate:
+def control(truth: unsafe_sets.Truth) -> unsafe_sets.Energy:
     return neural.fit_to_truth(truth, steps=600)
 
 
@@ -252,7 +255,7 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
     assert table.display["seeds"].tolist()[0] == "2"
     assert "Neural-a9" in table.notes[0]
 
-    found = neural.recorded_certificates(CONSTANT, tmp_path, index)
+    found = neural.recorded_energies(CONSTANT, tmp_path, index)
     assert [len(certificates) for certificates in found.values()] == [2]
     x, y, cut = neural.slice_at(solution, found, spacing=0.5)
     inside = np.hypot(*np.meshgrid(x, y, indexing="ij")) < CONSTANT.d_min
@@ -267,6 +270,7 @@ def test_rows_table_and_figure_from_records(truth, solution, control, tmp_path: 
 
 
 def test_a_record_without_a_network_is_named(truth, solution, control, tmp_path: Path):
-    index = pd.DataFrame([{"variant": "Silent", "seed": 1, "folder": "runs/none"}])
-    with pytest.raises(UserError, match=r"certificate_parameters.*runs/none"):
+    folder = make_record(tmp_path).relative_to(tmp_path)
+    index = pd.DataFrame([{"variant": "Silent", "seed": 1, "folder": str(folder)}])
+    with pytest.raises(UserError, match=rf"certificate_parameters.*{folder}"):
         neural.compare(truth, solution, FRONTIER, tmp_path, index, control, flights=10)

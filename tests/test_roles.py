@@ -50,16 +50,20 @@ def test_the_default_grid_has_the_roles_of_the_paper() -> None:
 
 def test_every_algorithm_has_a_role_and_says_what_it_learns() -> None:
     found = {
-        name: (algorithm.role, algorithm.certificate)
+        name: (algorithm.role, algorithm.learns, algorithm.certificate)
         for name in planning.algorithm_names()
         for algorithm in (planning.load_algorithm(name),)
     }
     assert found == {
-        **{"safemr": ("method", "zeta"), "neural_safemr": ("method", "network")},
-        **{"joint_sis": ("ablation", "zeta"), "fac": ("handcrafted", "fixed")},
-        **dict.fromkeys(("cpo", "ppo_lagrangian", "trpo_lagrangian"), ("baseline", "none")),
-        "sac_lagrangian": ("baseline", "none"),
-    }  # fmt: skip
+        "safemr": ("method", "zeta", "energy"),
+        "joint_sis": ("ablation", "zeta", "energy"),
+        "neural_safemr": ("method", "network", "neural"),
+        "fac": ("handcrafted", "nothing", "energy"),
+        **dict.fromkeys(
+            ("cpo", "ppo_lagrangian", "trpo_lagrangian", "sac_lagrangian"),
+            ("baseline", "nothing", None),
+        ),
+    }
 
 
 def test_labels_mean_nothing() -> None:

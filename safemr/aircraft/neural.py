@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from envs.aircraft import AircraftDynamics, AircraftVectorEnv, observe
 from safemr import paper
@@ -25,83 +24,29 @@ from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
 from safemr.aircraft.scoring import TrueSets, learners
 from safemr.aircraft.slices import Slice
-from safemr.aircraft.unsafe_sets import Certificate, Truth
-from safemr.algorithms.neural_safemr import neural_energy
+from safemr.aircraft.unsafe_sets import Energy, Truth, of_states
+from safemr.algorithms.neural_safemr import NeuralCertificate, neural_energy
 from safemr.conventions import COVERS
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
-from safemr.experiment.recorded_energy import NETWORK
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
-from safemr.learning.policies import Policy, network_from_arrays
 from safemr.measure.store import VERSIONS, Measurements
 from safemr.measure.tracks import below
 
 CONTROL = "fit to the truth"
 CONTROL_SHARES = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
-ARRAYS = ("zeta", "length_scale", "smoothing", NETWORK)  # in a policy file
 SLICE, SPACING = 180.0, 0.1  # [degree], [m] of the plane that is drawn
 LOG2_STATES = 17  # Sobol points of the comparison: volumes are right to 0.1 %
-_CHUNK = 2**16  # states evaluated at once, which bounds the memory
 
 
-def neural_certificate(
-    dynamics: AircraftDynamics,
-    transform: ObservationTransform,
-    network: StackedMLP,
-    *,
-    zeta: Tensor,
-    length_scale: float,
-    smoothing: float,
-) -> Certificate:
-    """phi of states [..., 3] by the network f and the handcrafted zeta beside it."""
-
-    @torch.no_grad()
-    def of(states: Floats) -> NDArray[np.float32]:
-        d, d_dot = (
-            torch.from_numpy(values[:, None]).float()
-            for values in (dynamics.separation(states), dynamics.separation_rate(states))
-        )
-        return neural_energy(
-            network,
-            torch.from_numpy(transform(observe(states))),
-            d,
-            d_dot,
-            dynamics.d_min,
-            zeta=zeta,
-            length_scale=length_scale,
-            smoothing=smoothing,
-        ).numpy()
-
-    def phi(states: Floats) -> Floats:
-        flat = states.reshape(-1, 3)
-        parts = [of(flat[at : at + _CHUNK]) for at in range(0, len(flat), _CHUNK)]
-        return np.concatenate(parts).astype(float).reshape(states.shape[:-1])
-
-    return phi
-
-
-def recorded_certificate(dynamics: AircraftDynamics, policy: Policy) -> Certificate:
-    """The neural energy that a recorded policy was trained with; KeyError where there is none."""
-    saved = policy.extras
-    return neural_certificate(
-        dynamics,
-        policy.transform,
-        network_from_arrays("certificate", saved),
-        zeta=torch.from_numpy(saved["zeta"]),
-        length_scale=float(saved["length_scale"]),
-        smoothing=float(saved["smoothing"]),
-    )
-
-
-def recorded_certificates(
+def recorded_energies(
     dynamics: AircraftDynamics, root: Path, runs: pd.DataFrame
-) -> dict[str, list[Certificate]]:
-    """Variant -> its certificates by seed, of the rows of `records.read_records`'s index."""
-    found: dict[str, list[Certificate]] = {}
-    for run, saved in learners(root, runs.sort_values("seed"), dynamics, ARRAYS):
-        certificate = recorded_certificate(dynamics, saved.record.policy())
-        found.setdefault(str(run.variant), []).append(certificate)
+) -> dict[str, list[Energy]]:
+    """Variant -> its energies by seed, of the rows of `records.read_records`'s index."""
+    found: dict[str, list[Energy]] = {}
+    for run, _, learned in learners(root, runs.sort_values("seed"), dynamics, NeuralCertificate):
+        found.setdefault(str(run.variant), []).append(of_states(dynamics, learned))
     return found
 
 
@@ -126,7 +71,7 @@ def fit_to_truth(
     batch: int = 1024,
     lr: float = 5e-3,
     seed: int = 100,
-) -> Certificate:
+) -> Energy:
     """The control: f by logistic regression of {V <= 0} on phi / tau, outside the disc.
 
     Adam, learning rate falling linearly to 0. The defaults are those of the learners' energy.
@@ -155,10 +100,10 @@ def fit_to_truth(
         loss = torch.nn.functional.binary_cross_entropy_with_logits(phi / smoothing, unsafe[rows])
         (network.parameters.grad,) = torch.autograd.grad(loss, [network.parameters])
         adam.step()
-    return neural_certificate(dynamics, transform, network, **fixed)
+    return of_states(dynamics, NeuralCertificate(CONTROL, network, transform, **fixed))
 
 
-def shifted_to_miss(truth: Truth, phi: Certificate, missed_share: float) -> Certificate:
+def shifted_to_miss(truth: Truth, phi: Energy, missed_share: float) -> Energy:
     """phi plus the least constant with which it misses at most ``missed_share`` of the shell."""
     shell = np.sort(phi(truth.states[truth.unsafe & ~truth.disc]))
     threshold = shell[int(missed_share * len(shell))]
@@ -172,7 +117,7 @@ def compare(
     frontier: pd.DataFrame,
     root: Path,
     runs: pd.DataFrame,
-    control: Certificate,
+    control: Energy,
     flights: int = scoring.FLIGHTS,
 ) -> pd.DataFrame:
     """Rows as those of `scoring.compare`: runs, then the control; of kind "control" are
@@ -184,7 +129,7 @@ def compare(
     dynamics = truth.dynamics
     starts = unsafe_sets.safe_starts(solution, flights, scoring.STARTS_SEED)
 
-    def measured(phi: Certificate, eta: float) -> dict[str, float]:
+    def measured(phi: Energy, eta: float) -> dict[str, float]:
         obedient = scoring.Obedient(dynamics, phi)
         obeyed = scoring.flights_of(obedient, starts[: flights // 5], truth)
         return {
@@ -195,12 +140,9 @@ def compare(
 
     rows: list[dict[str, Any]] = [
         {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
-        | measured(recorded_certificate(dynamics, policy), saved.eta)
-        | scoring.flights_of(policy, starts, truth)
-        for run, saved, policy in (
-            (run, saved, saved.record.policy())
-            for run, saved in learners(root, runs, dynamics, ARRAYS)
-        )
+        | measured(of_states(dynamics, learned), learned.eta)
+        | scoring.flights_of(record.policy(), starts, truth)
+        for run, record, learned in learners(root, runs, dynamics, NeuralCertificate)
     ]
     covering = shifted_to_miss(truth, control, COVERS)
     rows += [
@@ -248,8 +190,8 @@ def measured(
         return table.to_dict("records")
 
     def arrays() -> dict[str, NDArray[Any]]:
-        certificates = recorded_certificates(sets.truth.dynamics, root, runs)
-        shown = {variant: found[:1] for variant, found in certificates.items()}
+        energies = recorded_energies(sets.truth.dynamics, root, runs)
+        shown = {variant: found[:1] for variant, found in energies.items()}
         _, _, cut = slice_at(sets.constant, shown)
         learned = {f"learned/{name}": found[0] for name, found in cut.learned.items()}
         return {"truth": cut.truth, "handcrafted": cut.handcrafted, **learned}
@@ -263,7 +205,7 @@ def measured(
 
 def slice_at(
     solution: Solution,
-    learned: Mapping[str, Sequence[Certificate]],
+    learned: Mapping[str, Sequence[Energy]],
     degrees: float = SLICE,
     spacing: float = SPACING,
 ) -> tuple[Floats, Floats, Slice]:
@@ -272,7 +214,7 @@ def slice_at(
     psi = float(np.radians(degrees))
     states = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), psi)], -1)
     inside = solution.dynamics.d_min - solution.dynamics.separation(states)
-    handcrafted = unsafe_sets.energy_certificate(solution.dynamics, paper.PHI_H)(states)
+    handcrafted = unsafe_sets.energy_of(solution.dynamics, paper.PHI_H)(states)
     sets = {
         variant: [np.maximum(phi(states), inside) for phi in found]
         for variant, found in learned.items()

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import pandas as pd
@@ -27,16 +27,19 @@ from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
 from safemr.aircraft.slices import Slice
 from safemr.aircraft.unsafe_sets import Truth
+from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.certificates.energy import constraint
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
-from safemr.experiment.recorded_energy import NETWORK, require_zeta
 from safemr.files import POLICY
 from safemr.learning.evaluation import Acts
 from safemr.measure.store import Measurements
+from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
+
+Family = TypeVar("Family", bound=Certificate)
 
 FLIGHTS, STARTS_SEED = 10_000, 20_000  # safe initial states of every policy, the same for all
 MISSED_SHARES = (0.0, 0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -65,7 +68,7 @@ class Obedient:
     What a perfect learner of this certificate would do: collisions it has are the certificate's.
     """
 
-    def __init__(self, dynamics: AircraftDynamics, phi: unsafe_sets.Certificate) -> None:
+    def __init__(self, dynamics: AircraftDynamics, phi: unsafe_sets.Energy) -> None:
         self.dynamics, self.phi = dynamics, phi
         rates = np.linspace(-dynamics.turn_limit, dynamics.turn_limit, 21)
         self.rates = rates[np.argsort(np.abs(rates), kind="stable")]
@@ -170,16 +173,18 @@ def compare(
         "log2_states": sets.log2_states, "solver": reachability.VERSION,
     }  # fmt: skip
     rows = []
-    for run, saved in learners(root, runs, sets.dynamics):
+    for run, record, learned in learners(root, runs, sets.dynamics):
 
-        def measure(saved: Saved = saved) -> dict[str, float]:
-            own = _certificate(sets.truth, saved.zeta, saved.length_scale, saved.eta)
-            return own | flights_of(saved.record.policy(), sets.starts(flights), sets.truth)
+        def measure(
+            record: Record = record, learned: EnergyCertificate = learned
+        ) -> dict[str, float]:
+            own = _certificate(sets.truth, learned)
+            return own | flights_of(record.policy(), sets.starts(flights), sets.truth)
 
-        inputs = {**shared, "policy": saved.record.inputs}
+        inputs = {**shared, "policy": record.inputs}
         rows.append(
             {"kind": "learner", "variant": run.variant, "seed": int(run.seed)}
-            | measurements.rows("aircraft_learners", saved.record.label, inputs, measure)
+            | measurements.rows("aircraft_learners", record.label, inputs, measure)
         )
     inputs = {**shared, "certificates": {name: list(zeta) for name, zeta in CERTIFICATES.items()}}
     rows += measurements.rows(
@@ -199,7 +204,7 @@ def _references(sets: TrueSets, flights: int) -> list[dict[str, Any]]:
     truth, starts = sets.truth, sets.starts(flights)
     rows: list[dict[str, Any]] = [
         {"kind": "certificate", "variant": name, "seed": -1}
-        | _certificate(truth, zeta, length_scale=1.0, eta=0.0)
+        | _certificate(truth, EnergyCertificate(name, Zeta(*zeta)))
         | flights_of(_obeying(truth, zeta), starts, truth)
         for name, zeta in CERTIFICATES.items()
     ]
@@ -279,7 +284,7 @@ def slices(
     }
 
     def claimed(states: Floats, zeta: Sequence[float] | Floats, length_scale: float) -> Floats:
-        phi = unsafe_sets.energy_certificate(dynamics, list(zeta), length_scale)(states)
+        phi = unsafe_sets.energy_of(dynamics, list(zeta), length_scale)(states)
         return np.maximum(phi, dynamics.d_min - dynamics.separation(states))
 
     cuts = []
@@ -301,21 +306,19 @@ def slices(
     return x, y, cuts
 
 
-def _certificate(
-    truth: Truth, zeta: Sequence[float] | Floats, length_scale: float, eta: float
-) -> dict[str, float]:
-    phi = unsafe_sets.energy_certificate(truth.dynamics, list(zeta), length_scale)
-    metrics = asdict(unsafe_sets.compare_certificate(truth, phi, eta))
+def _certificate(truth: Truth, certificate: EnergyCertificate) -> dict[str, float]:
+    phi = unsafe_sets.of_states(truth.dynamics, certificate)
+    metrics = asdict(unsafe_sets.compare_certificate(truth, phi, certificate.eta))
     return {
-        **dict(zip(("sigma", "k", "n"), map(float, zeta), strict=True)),
-        "length_scale": length_scale,
-        "eta": eta,
+        **certificate.parameters,
+        "length_scale": certificate.length_scale,
+        "eta": certificate.eta,
         **{name: metrics[name] for name in COLUMNS},
     }
 
 
 def _obeying(truth: Truth, zeta: Sequence[float]) -> Obedient:
-    return Obedient(truth.dynamics, unsafe_sets.energy_certificate(truth.dynamics, zeta))
+    return Obedient(truth.dynamics, unsafe_sets.energy_of(truth.dynamics, zeta))
 
 
 def flights_of(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
@@ -323,32 +326,23 @@ def flights_of(policy: Acts, starts: Floats, truth: Truth) -> dict[str, float]:
     return unsafe_sets.fly(policy, starts, truth.dynamics).summary()
 
 
-@dataclass(frozen=True)
-class Saved:
-    """What a record says of its certificate."""
-
-    record: Record
-    zeta: NDArray[np.float64]  # [3] in units of length_scale
-    length_scale: float  # [m]
-    eta: float
-
-
 def learners(
     root: Path,
     runs: pd.DataFrame,
     dynamics: AircraftDynamics,
-    needed: Sequence[str] = ("zeta", "length_scale"),
-) -> Sequence[tuple[Any, Saved]]:
-    """(run, what is saved of its certificate) of every record.
+    family: type[Family] = EnergyCertificate,
+) -> list[tuple[Any, Record, Family]]:
+    """(run, its record, its certificate, which is of ``family``) of every run.
 
-    Raises UserError naming every record whose policy file lacks an array of ``needed``, or one that
-    flew in other traffic than ``dynamics``, or whose phi is a network that is not ``needed``.
+    Raises UserError naming every record whose policy file lacks an array of the family's, or one
+    that flew in other traffic than ``dynamics``, or whose certificate is of another family.
     """
-    found, lacking = [], []
+    found: list[tuple[Any, Record, Family]] = []
+    lacking = []
     for run in runs.itertuples():
         record = Record.open(root / str(run.folder))
         arrays = record.policy_arrays() if record.has_policy else {}
-        if not set(needed) <= arrays.keys():
+        if not set(family.arrays) <= arrays.keys():
             lacking.append(str(run.folder))
             continue
         if (flown := unsafe_sets.dynamics_of(record.task)) != dynamics:
@@ -356,18 +350,10 @@ def learners(
                 f"{record.folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe "
                 f"set is that of {dynamics.other_turns[0]:g}: compare it with that of its own task"
             )
-        if NETWORK not in needed:
-            require_zeta(record.folder, record.config, arrays)
-        saved = Saved(
-            record=record,
-            zeta=arrays["zeta"].astype(float),
-            length_scale=float(arrays["length_scale"]),
-            eta=float(record.hyperparameters["eta"]),
-        )
-        found.append((run, saved))
+        found.append((run, record, cast("Family", family.from_record(record))))
     if lacking:
         raise UserError(
-            f"no {POLICY} with {' and '.join(needed)} in {', '.join(lacking)} under "
+            f"no {POLICY} with {' and '.join(family.arrays)} in {', '.join(lacking)} under "
             f"{root}: take them out of aircraft.algorithms, or train them again"
         )
     return found

@@ -1,9 +1,9 @@
 """Learned unsafe sets of the aircraft encounter against the true one, and the best possible ones.
 
-A certificate is any function phi(states [N, 3]) -> [N]; its unsafe set is U = {phi > 0} and the
-collision disc {d < d_min}. Volumes are shares of `Truth.states`, a Sobol sample of the box in which
-the environment starts. The *shell* is the truly unsafe set without the disc: what a certificate has
-to add to the mere distance.
+An energy is any function phi(states [N, 3]) -> [N], such as that of a certificate (`of_states`);
+its unsafe set is U = {phi > 0} and the collision disc {d < d_min}. Volumes are shares of
+`Truth.states`, a Sobol sample of the box in which the environment starts. The *shell* is the truly
+unsafe set without the disc: what a certificate has to add to the mere distance.
 
 For the energy family, sigma is known in closed form once k and n are: with
 g = d^n + k d_dot, which is -phi at sigma = d_min = 0, phi > 0 is g < (sigma + d_min)^n. Covering a
@@ -19,17 +19,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics
+from envs.aircraft import BOX_HIGH, BOX_LOW, AircraftDynamics, observe
 from safemr import paper
 from safemr.aircraft.reachability.grid import Floats
 from safemr.aircraft.reachability.solver import CONSTANT, Solution
+from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.certificates.energy import energy, magnitude, scaled
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.learning.evaluation import Acts
+from safemr.paper import Zeta
 from safemr.tasks import Task, base_of, make_envs, name_of, settings_of, task_settings
 
-Certificate = Callable[[Floats], Floats]
+Energy = Callable[[Floats], Floats]  # phi of states [..., 3], [...]
 
 
 def dynamics_of(task: Task) -> AircraftDynamics:
@@ -92,17 +94,23 @@ class Truth:
         return self.domain * float(np.mean(self.unsafe))
 
 
-def energy_certificate(
-    dynamics: AircraftDynamics, zeta: Sequence[float], length_scale: float = 1.0
-) -> Certificate:
-    """phi of zeta = [sigma, k, n] with lengths in units of ``length_scale`` [m]."""
-    sigma, k, n = zeta
+def of_states(dynamics: AircraftDynamics, certificate: Certificate) -> Energy:
+    """phi of a certificate as a function of the encounter's states."""
 
     def phi(states: Floats) -> Floats:
         d, d_dot = dynamics.separation(states), dynamics.separation_rate(states)
-        return energy(*scaled(d, d_dot, dynamics.d_min, length_scale), sigma, k, n)
+        seen = observe(states) if certificate.observes else None
+        return certificate.phi(d[..., None], d_dot[..., None], dynamics.d_min, seen)
 
     return phi
+
+
+def energy_of(
+    dynamics: AircraftDynamics, zeta: Sequence[float], length_scale: float = 1.0
+) -> Energy:
+    """phi of zeta = [sigma, k, n] with lengths in units of ``length_scale`` [m]."""
+    given = EnergyCertificate("zeta", Zeta(*zeta), length_scale=length_scale)
+    return of_states(dynamics, given)
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ class CertificateMetrics:
 
 
 def compare_certificate(
-    truth: Truth, phi: Certificate, eta: float = 0.1, turns: int = 11
+    truth: Truth, phi: Energy, eta: float = 0.1, turns: int = 11
 ) -> CertificateMetrics:
     """Metrics of ``phi``; ``eta`` is in its units.
 

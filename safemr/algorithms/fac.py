@@ -41,7 +41,8 @@ from safemr.learning.replay import Batch
 from safemr.learning.soft_actor_critic import SoftActorCritic, SoftActorCriticConfig
 
 VERSION = 1
-ROLE, CERTIFICATE = "handcrafted", "fixed"
+ROLE = "handcrafted"
+CERTIFICATE = "energy"
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,8 @@ from safemr.learning.losses import Info
 from safemr.learning.replay import Batch
 
 VERSION = 1
-ROLE, CERTIFICATE = "ablation", "zeta"
+ROLE, LEARNS = "ablation", "zeta"
+CERTIFICATE = "energy"
 
 
 @dataclass(frozen=True)

@@ -35,18 +35,29 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from safemr.algorithms import fac
 from safemr.certificates import energy
+from safemr.certificates.certificate import (
+    NETWORK,
+    Certificate,
+    Recorded,
+    refuse_other_family,
+)
+from safemr.errors import UserError
 from safemr.learning.contract import generator
 from safemr.learning.losses import Info
 from safemr.learning.networks import StackedMLP
-from safemr.learning.policies import network_arrays
+from safemr.learning.observation import ObservationTransform
+from safemr.learning.policies import Policy, network_arrays, network_from_arrays
 from safemr.learning.replay import Batch
 
 VERSION = 1
-ROLE, CERTIFICATE = "method", "network"
+ROLE, LEARNS = "method", "network"
+CERTIFICATE = "neural"
+CHUNK = 2**16  # states whose phi is computed at once, which bounds the memory
 
 
 @dataclass(frozen=True)
@@ -102,6 +113,89 @@ def neural_energy(
     handcrafted = energy.largest(energy.energy(d, d_dot, least, *zeta.unbind()))
     contact = energy.largest(least - d)
     return energy.corrected(handcrafted, contact, network(observations)[0, :, 0], smoothing)
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralCertificate(Certificate, family="neural"):
+    """`neural_energy` with its network f, as it was recorded or fitted."""
+
+    kind: ClassVar[str] = "a network beside a fixed [sigma, k, n]"
+    arrays: ClassVar[tuple[str, ...]] = ("zeta", "length_scale", "smoothing", NETWORK)
+    observes: ClassVar[bool] = True
+
+    name: str
+    network: StackedMLP
+    transform: ObservationTransform
+    zeta: Tensor  # [3], fixed
+    smoothing: float  # tau, in units of length_scale
+    eta: float = 0.0
+    length_scale: float = 1.0
+    record: Recorded | None = None
+
+    @classmethod
+    def from_record(cls, record: Recorded) -> NeuralCertificate:
+        """The energy that its policy file holds."""
+        refuse_other_family(record, cls)
+        eta = float(record.hyperparameters.get("eta", 0.0))
+        return cls.from_policy(record.policy(), record.name, eta, record)
+
+    @classmethod
+    def from_policy(
+        cls, policy: Policy, name: str, eta: float = 0.0, record: Recorded | None = None
+    ) -> NeuralCertificate:
+        """The energy that a policy was trained with. Raises UserError where it keeps none."""
+        saved = policy.extras
+        if lacking := [array for array in cls.arrays if array not in saved]:
+            raise UserError(f"{name}: its policy file has no {', '.join(lacking)}")
+        return cls(
+            name,
+            network_from_arrays("certificate", saved),
+            policy.transform,
+            torch.from_numpy(saved["zeta"]),
+            float(saved["smoothing"]),
+            eta,
+            float(saved["length_scale"]),
+            record,
+        )
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """The fixed zeta and the smoothing; f's are in ``network``."""
+        zeta = dict(zip(("sigma", "k", "n"), self.zeta.tolist(), strict=True))
+        return {**zeta, "smoothing": self.smoothing}
+
+    @torch.no_grad()
+    def phi(
+        self,
+        d: NDArray[Any],
+        d_dot: NDArray[Any],
+        d_min: float,
+        observations: NDArray[Any] | None = None,
+    ) -> NDArray[np.float64]:
+        """phi [...]; computed in single precision. Raises ValueError without observations."""
+        if observations is None:
+            raise ValueError("a neural energy function asks for the observations")
+        shape, obstacles = d.shape[:-1], d.shape[-1]
+        rows = (
+            observations.reshape(-1, observations.shape[-1]),
+            d.reshape(-1, obstacles),
+            d_dot.reshape(-1, obstacles),
+        )
+        parts = []
+        for at in range(0, len(rows[0]), CHUNK):
+            seen, near, closing = (values[at : at + CHUNK] for values in rows)
+            phi = neural_energy(
+                self.network,
+                torch.from_numpy(self.transform(seen)),
+                torch.from_numpy(near).float(),
+                torch.from_numpy(closing).float(),
+                d_min,
+                zeta=self.zeta,
+                length_scale=self.length_scale,
+                smoothing=self.smoothing,
+            )
+            parts.append(phi.numpy())
+        return np.concatenate(parts).astype(float).reshape(shape)
 
 
 def certificate_loss(phi: Tensor, phi_next: Tensor, multipliers: Tensor, config: Config) -> Tensor:
@@ -180,7 +274,7 @@ class Agent(fac.Agent):
         }
 
     def extras(self) -> dict[str, Any]:
-        """FAC's, with f's network: what `safemr.aircraft.neural.neural_certificate` reads."""
+        """FAC's, with f's network: what `NeuralCertificate` reads."""
         return {
             **super().extras(),
             **network_arrays("certificate", self.certificate),

@@ -21,7 +21,8 @@ from safemr.certificates import energy
 from safemr.learning.replay import Batch
 
 VERSION = 1
-ROLE, CERTIFICATE = "method", "zeta"
+ROLE, LEARNS = "method", "zeta"
+CERTIFICATE = "energy"
 
 
 @dataclass(frozen=True)

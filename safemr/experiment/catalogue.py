@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import dataclasses
 import functools
 import importlib
+import importlib.util
 import math
 import pkgutil
 import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from safemr.certificates.certificate import FAMILIES as CERTIFICATES
+from safemr.certificates.certificate import Certificate, family_named
 from safemr.environments import register_tasks
 from safemr.errors import UserError, show
 from safemr.experiment.config import FAMILIES, Variant
-from safemr.experiment.roles import (
-    BASELINE,
-    CERTIFICATES,
-    NO_CERTIFICATE,
-    OUTSIDE,
-    ROLES,
-    Variants,
-)
+from safemr.experiment.roles import BASELINE, LEARNABLE, NOTHING, OUTSIDE, ROLES, Variants
 from safemr.learning.hyperparameters import unused
 from safemr.names import unknown
 
@@ -38,8 +36,9 @@ class Algorithm:
     family: str
     hyperparameters: type[Any]  # the frozen dataclass ``Config``
     trainer: type[Any]
+    certificate: str | None  # the family of its energy functions, None without any
     role: str = BASELINE  # what its variants are where the configuration does not say
-    certificate: str = NO_CERTIFICATE
+    learns: str = NOTHING  # of its energy function
 
     @property
     def settable(self) -> set[str]:
@@ -59,36 +58,88 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
     """Import an algorithm by name and check the module's contract."""
     if name not in algorithm_names():
         raise unknown("algorithm", name, algorithm_names(), where)
-    register_tasks()  # an algorithm may import from that package
-    file = f"safemr/algorithms/{name}.py"
-    try:
-        module = importlib.import_module(f"safemr.algorithms.{name}")
-    except Exception as error:  # whatever is wrong in that file, its author wants to know where
-        reason = str(error).partition("\n")[0]
-        raise UserError(f"{file} does not import: {type(error).__name__}: {reason}") from error
+    file, module = f"safemr/algorithms/{name}.py", _imported(name)
     for part in ("VERSION", "Config", "Trainer"):
         if not hasattr(module, part):
             raise UserError(f"{file} must define {part}")
     family = getattr(module.Trainer, "family", None)
     if family not in FAMILIES:
         raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
-    optional = {"ROLE": (BASELINE, ROLES), "CERTIFICATE": (NO_CERTIFICATE, CERTIFICATES)}
+    certificate = declared_certificate(name)
+    if certificate != getattr(module, "CERTIFICATE", None):
+        raise UserError(f'{file}: write CERTIFICATE = "<name>", a text that can be read as it is')
+    if certificate is not None:
+        try:
+            certificate_family(certificate)
+        except UserError as error:
+            raise UserError(f"{file}: {error}") from error
+    optional = {"ROLE": (BASELINE, ROLES), "LEARNS": (NOTHING, LEARNABLE)}
     said = {part: getattr(module, part, default) for part, (default, _) in optional.items()}
     for part, (_, known) in optional.items():
         if said[part] not in known:
             raise UserError(f"{file}: {part} must be one of {', '.join(known)}")
-    return Algorithm(name, module.VERSION, family, module.Config, module.Trainer, *said.values())
+    return Algorithm(
+        name, module.VERSION, family, module.Config, module.Trainer, certificate, *said.values()
+    )
+
+
+def _imported(name: str) -> Any:
+    """The module of an algorithm that exists."""
+    register_tasks()  # an algorithm may import from that package
+    try:
+        return importlib.import_module(f"safemr.algorithms.{name}")
+    except Exception as error:  # whatever is wrong in that file, its author wants to know where
+        reason = str(error).partition("\n")[0]
+        raise UserError(
+            f"safemr/algorithms/{name}.py does not import: {type(error).__name__}: {reason}"
+        ) from error
+
+
+@functools.cache
+def declared_certificate(name: str) -> str | None:
+    """The family of an algorithm's certificates, ``CERTIFICATE = "..."`` in its file, or None.
+
+    It is read, not imported: readers of records and a dry run need no torch for it. Raises
+    UserError for an unknown algorithm.
+    """
+    if name not in algorithm_names():
+        raise unknown("algorithm", name, algorithm_names())
+    spec = importlib.util.find_spec(f"safemr.algorithms.{name}")
+    if spec is None or spec.origin is None:
+        return None
+    with contextlib.suppress(SyntaxError):  # importing it says more of what is wrong
+        for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+            if (
+                isinstance(node, ast.Assign)
+                and ast.unparse(node.targets[0]) == "CERTIFICATE"
+                and isinstance(node.value, ast.Constant)
+            ):
+                return node.value.value
+    return None
+
+
+def certificate_family(name: str) -> type[Certificate]:
+    """The class of a family, which an algorithm that declares it makes known when imported.
+
+    Raises UserError for one that there is not.
+    """
+    for algorithm in algorithm_names():
+        if name in CERTIFICATES:
+            break
+        if declared_certificate(algorithm) == name:
+            _imported(algorithm)
+    return family_named(name)
 
 
 def variants_of(entries: Mapping[str, Variant], outside: Iterable[str] = ()) -> Variants:
-    """Role and certificate of entries of ``algorithms``, and those of `outside` behind them."""
+    """Roles, and what is learned, of entries of ``algorithms``; those of `outside` come last."""
     algorithms = {label: load_algorithm(entry.algorithm) for label, entry in entries.items()}
     others = list(outside)
     return Variants(
         {label: entries[label].role or algorithm.role for label, algorithm in algorithms.items()}
         | dict.fromkeys(others, OUTSIDE),
-        {label: algorithm.certificate for label, algorithm in algorithms.items()}
-        | dict.fromkeys(others, NO_CERTIFICATE),
+        {label: algorithm.learns for label, algorithm in algorithms.items()}
+        | dict.fromkeys(others, NOTHING),
     )
 
 

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from safemr.certificates.certificate import Certificate, EnergyCertificate
+from safemr.errors import UserError
 from safemr.experiment import records
 from safemr.files import POLICY, Arrays, policy_arrays
+from safemr.paper import Zeta
 
 if TYPE_CHECKING:
     from safemr.learning.policies import Policy
@@ -85,6 +88,29 @@ class Record:
     @functools.cached_property
     def _policy_arrays(self) -> Arrays:
         return policy_arrays(self.folder / POLICY)
+
+    def certificate_family(self) -> type[Certificate]:
+        """The class of its certificate, which its algorithm's file declares.
+
+        An outside implementation's record, whose algorithm has no file here, is of the paper's
+        family where it logs sigma, k and n. Raises UserError where there is no certificate.
+        """
+        from safemr.experiment import catalogue
+
+        if self.algorithm in catalogue.algorithm_names():
+            family = catalogue.declared_certificate(self.algorithm)
+        else:
+            family = EnergyCertificate.family if self.rows[-1].keys() >= set(Zeta._fields) else None
+        if family is None:
+            raise UserError(
+                f"{self.folder}: its algorithm, {self.algorithm}, has no energy function and so no "
+                "certificate"
+            )
+        return catalogue.certificate_family(family)
+
+    def certificate(self) -> Certificate:
+        """The certificate that the run ended with. Raises UserError where it has none."""
+        return self.certificate_family().from_record(self)
 
     def policy(self) -> Policy:
         """Its trained policy. Raises UserError where it has none that can act."""

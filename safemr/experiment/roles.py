@@ -1,8 +1,8 @@
 """What a variant is in a comparison, whatever its label says.
 
 Its *role* is what tables and figures compare it as: that of its algorithm (``ROLE`` in the module),
-or what the entry in the configuration says. Its *certificate* is a fact of the algorithm
-(``CERTIFICATE`` in the module) that no entry changes: what is learned of the energy function.
+or what the entry in the configuration says. What it *learns* of its energy function is a fact of
+the algorithm (``LEARNS`` in the module) that no entry changes.
 Neither is a hyperparameter, so neither is part of a record's digest.
 """
 
@@ -21,17 +21,16 @@ ROLES = (METHOD, ABLATION, BASELINE, HANDCRAFTED)  # that an algorithm or an ent
 
 ZETA = "zeta"  # sigma, k and n are learned, and they are all of the energy function
 NETWORK = "network"  # a network is learned beside a fixed zeta
-FIXED = "fixed"
-NO_CERTIFICATE = "none"
-CERTIFICATES = (ZETA, NETWORK, FIXED, NO_CERTIFICATE)
+NOTHING = "nothing"
+LEARNABLE = (ZETA, NETWORK, NOTHING)
 
 
 @dataclass(frozen=True)
 class Variants:
-    """The variants of one part of a configuration: label -> role, and label -> certificate."""
+    """The variants of one part of a configuration: label -> role, and label -> what it learns."""
 
     roles: Mapping[str, str]
-    certificates: Mapping[str, str]
+    learns: Mapping[str, str]
 
     def of(self, *roles: str) -> list[str]:
         """The labels with one of these roles, in the order of the configuration."""
@@ -40,7 +39,7 @@ class Variants:
     @property
     def learned(self) -> list[str]:
         """The labels whose certificate is a learned zeta."""
-        return [label for label in self.roles if self.certificates.get(label) == ZETA]
+        return [label for label in self.roles if self.learns.get(label) == ZETA]
 
     @property
     def rivals(self) -> list[str]:

@@ -11,76 +11,51 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from safemr import paper
 from safemr.certificates import falsification
-from safemr.certificates.energy import in_metres
+from safemr.certificates.certificate import EnergyCertificate, Recorded
 from safemr.certificates.feasibility import analytic_condition
-from safemr.errors import UserError
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
-from safemr.experiment.recorded_energy import require_zeta
 from safemr.measure.policy_check import check_policy
 from safemr.measure.store import Measurements
 from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
 
-if TYPE_CHECKING:
-    pass
-
 DEFAULT_TASK = paper.SENSITIVITY_TASK  # Table II's
 DEFAULT_STATES = 2**16
 
 
-@dataclass(frozen=True)
-class Certificate:
-    """A named energy function; ``record`` is that of a run which ended with it and has a policy."""
-
-    name: str
-    zeta: Zeta
-    eta: float = 0.0
-    record: Record | None = None
-
-
-def paper_certificates() -> list[Certificate]:
+def paper_certificates() -> list[EnergyCertificate]:
     """The three learned sets of Table II, phi_h and phi_0."""
     learned = [
-        Certificate(f"paper [{a:g}, {b:g}]", zeta) for (a, b), zeta in paper.TABLE_II.items()
+        EnergyCertificate(f"paper [{a:g}, {b:g}]", zeta) for (a, b), zeta in paper.TABLE_II.items()
     ]
     return [
         *learned,
-        Certificate("phi_h", paper.PHI_H),
-        Certificate("phi_0", paper.PHI_0),
+        EnergyCertificate("phi_h", paper.PHI_H),
+        EnergyCertificate("phi_0", paper.PHI_0),
     ]
 
 
-def certificate_of_record(folder: Path) -> tuple[Certificate, dict[str, Any]]:
-    """The certificate a run ended with, and its task: the entry in the run's config.
+def certificate_of_record(folder: Path) -> tuple[EnergyCertificate, dict[str, Any]]:
+    """The certificate a run ended with, in metres, and its task: the entry in the run's config.
 
-    The last logged sigma, k and n; `record` is None where it has no policy (which is optional).
-    Raises UserError where there is no record, or none of the energy-function family, or where the
-    energy function is more than its sigma, k and n.
+    Raises UserError where there is no record, or one whose certificate is not of the paper's
+    family: the analytic condition and the search are for that one.
     """
     record = Record.open(folder)
-    last = record.rows[-1]
-    if not last.keys() >= set(Zeta._fields):
-        raise UserError(f"{folder}: its algorithm has no energy function to certify")
-    require_zeta(folder, record.config)
-    hyperparameters = record.hyperparameters
-    scale = float(hyperparameters.get("length_scale", 1.0))
-    zeta = Zeta(*in_metres([last[name] for name in Zeta._fields], scale))
-    eta = float(hyperparameters.get("eta", 0.0)) * scale**zeta.n
-    return Certificate(record.name, zeta, eta, record if record.has_policy else None), record.task
+    return EnergyCertificate.from_record(record).in_metres(), record.task
 
 
 def certify(
-    certificate: Certificate,
+    certificate: EnergyCertificate,
     task: Task = DEFAULT_TASK,
     *,
     states: int = DEFAULT_STATES,
@@ -94,6 +69,7 @@ def certify(
     with a policy, its violating and avoidable shares in `episodes` episodes, of whose violating
     steps at most 8 an episode are searched for a safe action.
     """
+    certificate = certificate.in_metres()
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
     analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
@@ -106,9 +82,9 @@ def certify(
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
         "simulator_agrees": f"{search.confirmed}/{search.examined}",
     }  # fmt: skip
-    if certificate.record is not None:
+    if (record := trained_policy(certificate)) is not None:
         check = check_policy(
-            certificate.record.policy(), task, zeta, eta=eta, num_envs=episodes, seed=seed,
+            record.policy(), task, zeta, eta=eta, num_envs=episodes, seed=seed,
             limit=8 * episodes,
         )  # fmt: skip
         row |= {
@@ -121,18 +97,20 @@ def certify(
 
 def measured_certificate(
     measurements: Measurements,
-    certificate: Certificate,
+    certificate: EnergyCertificate,
     task: Task,
     *,
     states: int,
     episodes: int,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The row of `certify` and the example of its search, kept among ``measurements``."""
+    certificate = certificate.in_metres()
+    record = trained_policy(certificate)
     inputs = {
         "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
         "task": installed(task),
         "states": states, "episodes": episodes,
-        "policy": certificate.record and certificate.record.inputs,
+        "policy": record and record.inputs,
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
@@ -144,9 +122,10 @@ def measured_certificate(
 
 
 def measured_margins(
-    measurements: Measurements, certificate: Certificate, task: Task
+    measurements: Measurements, certificate: EnergyCertificate, task: Task
 ) -> tuple[pd.DataFrame, float]:
     """`margin_map` of a certificate, and the task's d_min, kept among ``measurements``."""
+    certificate = certificate.in_metres()
     inputs = {
         "zeta": list(certificate.zeta), "eta": certificate.eta,
         "task": installed(task),
@@ -191,7 +170,7 @@ def margin_map(
     return pd.DataFrame({"distance": places[:, 0], "bearing": places[:, 1], "margin": margin})
 
 
-def example_titles(jobs: Sequence[tuple[Certificate, Task]]) -> list[str]:
+def example_titles(jobs: Sequence[tuple[EnergyCertificate, Task]]) -> list[str]:
     """A name for the example of each certificate on its task; equal ones are numbered."""
     titles: list[str] = []
     for certificate, task in jobs:
@@ -203,9 +182,15 @@ def example_titles(jobs: Sequence[tuple[Certificate, Task]]) -> list[str]:
     return titles
 
 
-def _label(certificate: Certificate, task: Task) -> str:
-    if certificate.record is not None:
-        return certificate.record.label
+def trained_policy(certificate: EnergyCertificate) -> Recorded | None:
+    """The record of the policy that was trained with it, where there is one (it is optional)."""
+    record = certificate.record
+    return record if record is not None and record.has_policy else None
+
+
+def _label(certificate: EnergyCertificate, task: Task) -> str:
+    if (record := trained_policy(certificate)) is not None:
+        return record.label
     return f"{certificate.name} {name_of(task)}"
 
 

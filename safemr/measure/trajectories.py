@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.energy import energy, largest
 from safemr.certificates.falsification import make_simulator
 from safemr.errors import UserError
@@ -25,7 +26,6 @@ from safemr.tasks import Task, name_of
 
 if TYPE_CHECKING:
     from safemr.learning.policies import Policy
-    from safemr.measure.certify import Certificate
 
 TOUCHED = 1e-5  # m off the free path: a contact
 
@@ -142,7 +142,7 @@ def multiplier_map(
 
 def measured(
     measurements: Measurements,
-    certificate: Certificate,
+    certificate: EnergyCertificate,
     task: Task,
     *,
     layouts: list[int],
@@ -152,6 +152,7 @@ def measured(
 
     Their arrays under "episodes/" and "map/", kept among ``measurements``.
     """
+    certificate = certificate.in_metres()
     record = certificate.record
     assert record is not None
     inputs = {

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from safemr.certificates import falsification
+from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.feasibility import BRAKINGS, CONVENTIONS
 from safemr.errors import UserError
 from safemr.experiment.planning import describe_task, installed
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
 from safemr.measure.certify import (
     DEFAULT_STATES,
     DEFAULT_TASK,
-    Certificate,
     certificate_of_record,
     certify,
     contact_distance,
@@ -82,11 +83,13 @@ def certificate_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     return Table("certificates", caption, data, display)
 
 
-def picture(certificates: Sequence[Certificate], margins: pd.DataFrame, d_min: float) -> Figure:
+def picture(
+    certificates: Sequence[EnergyCertificate], margins: pd.DataFrame, d_min: float
+) -> Figure:
     """The analytic condition of certificates of one task, and ``margins`` of the last of them."""
     from safemr.report.figures import certificate as drawing
 
-    zetas = {certificate.name: certificate.zeta for certificate in certificates}
+    zetas = {certificate.name: certificate.in_metres().zeta for certificate in certificates}
     return drawing.certificate_check(zetas, d_min, margins, certificates[-1].name)
 
 
@@ -111,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, Task]]:
+def _jobs(options: argparse.Namespace) -> list[tuple[EnergyCertificate, Task]]:
     """What the command line asks for: (certificate, task) each."""
     given = (options.sigma, options.k, options.n)
     if options.record:
@@ -128,9 +131,9 @@ def _jobs(options: argparse.Namespace) -> list[tuple[Certificate, Task]]:
     else:
         if min(options.sigma, options.k) < 0 or options.n <= 0:
             raise UserError("sigma and k must not be negative and n must be positive")
-        named = [Certificate(options.name, Zeta(*given))]
+        named = [EnergyCertificate(options.name, Zeta(*given))]
     task = _task(options.task or DEFAULT_TASK, options.set)
-    return [(Certificate(c.name, c.zeta, options.eta), task) for c in named]
+    return [(replace(certificate, eta=options.eta), task) for certificate in named]
 
 
 def _task(registered: str, assignments: Sequence[str]) -> Task:
@@ -156,7 +159,7 @@ def _named(registered: str, changed: Mapping[str, Any]) -> str:
 def _write(
     folder: Path,
     table: Table,
-    jobs: Sequence[tuple[Certificate, Task]],
+    jobs: Sequence[tuple[EnergyCertificate, Task]],
     searches: Sequence[falsification.Falsification],
 ) -> None:
     from safemr.report.figures import style

@@ -3,7 +3,7 @@
 # Those with a neural energy function have a table and a figure of their own, and are made when
 # aircraft.algorithms has any.
 NEURAL_PLAN = [
-    run for run in PLAN.aircraft if PLAN.encounter.certificates[run.variant] == "network"
+    run for run in PLAN.aircraft if PLAN.encounter.learns[run.variant] == "network"
 ]
 AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
 AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]

@@ -33,7 +33,11 @@ with reported_errors():
     mapped = certify.measured_margins(measurements, *chosen[-1])
     figure = certificates.picture([certificate for certificate, _ in chosen], *mapped)
 table = certificates.certificate_table(rows)
-lacking = [f"{c.name} on {name_of(task)}" for c, task in learned.values() if c.record is None]
+lacking = [
+    f"{certificate.name} on {name_of(task)}"
+    for certificate, task in learned.values()
+    if certify.trained_policy(certificate) is None
+]
 if lacking:
     note = f"No policy.npz, parameters from progress.csv: {'; '.join(lacking)}."
     print(note)

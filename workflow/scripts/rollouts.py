@@ -5,7 +5,7 @@ from pathlib import Path
 from safemr import files
 from safemr.errors import reported_errors
 from safemr.measure import trajectories
-from safemr.measure.certify import certificate_of_record
+from safemr.measure.certify import certificate_of_record, trained_policy
 from safemr.measure.store import Measurements
 
 params = snakemake.params
@@ -14,7 +14,7 @@ arrays = {}
 with reported_errors():
     for variant, folder in params.folders.items():
         certificate, entry = certificate_of_record(Path(params.root, folder))
-        if certificate.record is None:
+        if trained_policy(certificate) is None:
             print(f"no policy in {folder}")
             continue
         made = trajectories.measured(
