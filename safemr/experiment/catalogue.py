@@ -113,6 +113,7 @@ def declared_certificate(name: str) -> str | None:
                 isinstance(node, ast.Assign)
                 and ast.unparse(node.targets[0]) == "CERTIFICATE"
                 and isinstance(node.value, ast.Constant)
+                and isinstance(node.value.value, str)
             ):
                 return node.value.value
     return None
