@@ -15,7 +15,8 @@ from safemr.experiment import overview, train
 from safemr.learning import contract
 
 ROOT = Path(__file__).resolve().parents[1]
-TASK, SHORT = "Hazards-0.15-Push", ("task.max_episode_steps=50", "hidden=16")
+TASK, NAME = "Hazards-0.15-Push", "Short-Push"
+SHORT = ("task.max_episode_steps=50", "hidden=16")
 DIVERGING = {
     # An entropy that is hardly reached: the temperature, and with it every loss, grows for ever.
     "fac": ("target_entropy=1.386", "temperature_lr=1", "start_steps=100", "batch_size=32"),
@@ -31,21 +32,22 @@ def test_a_diverging_run_ends_in_one_line_and_is_named(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = [word for value in (*SHORT, *DIVERGING[name]) for word in ("--set", value)]
-    arguments = ["--task", TASK, "--algorithm", name, "--steps", "4000", "--eval-episodes", "1"]
+    arguments = ["--task", TASK, "--task-name", NAME, "--algorithm", name]
+    arguments += ["--steps", "4000", "--eval-episodes", "1"]
     lines = []
     for _ in range(2):  # what is deterministic fails again in the same way
         assert train.main([*arguments, *settings, "--out", str(tmp_path)]) == 4
         lines.append(capsys.readouterr().err.splitlines()[-1])
     assert lines[0] == lines[1]
     assert re.fullmatch(
-        rf"error: {name} {TASK} seed 100: (\w+) became \d{{9,}}\.\d at step \d+; "
+        rf"error: {name} {NAME} seed 100: (\w+) became \d{{9,}}\.\d at step \d+; "
         r"last good log point: step \d+; no checkpoint yet",
         lines[0],
     )
     assert not list(tmp_path.glob("runs/*/*/*"))
     assert overview.main([str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert f"{name} {TASK} seed 100" in printed
+    assert f"{name} {NAME} seed 100" in printed
     assert "failed: " in printed
 
 
