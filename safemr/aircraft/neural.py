@@ -120,8 +120,8 @@ def compare(
     control: Energy,
     flights: int = scoring.FLIGHTS,
 ) -> pd.DataFrame:
-    """Rows as those of `scoring.compare`: runs, then the control; of kind "control" are
-    the control's volumes when it is shifted to miss each of `CONTROL_SHARES`.
+    """Rows as those of `scoring.compare`: runs, then the control; of kind "control" are the
+    control's volumes when it is shifted to miss each of `CONTROL_SHARES`.
 
     ``obeyed_collision_share`` is that of the policy which obeys the certificate (`Obedient`), from
     a fifth of the starts.

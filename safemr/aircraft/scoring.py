@@ -14,7 +14,7 @@ import functools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -173,7 +173,7 @@ def compare(
         "log2_states": sets.log2_states, "solver": reachability.VERSION,
     }  # fmt: skip
     rows = []
-    for run, record, learned in learners(root, runs, sets.dynamics):
+    for run, record, learned in learners(root, runs, sets.dynamics, EnergyCertificate):
 
         def measure(
             record: Record = record, learned: EnergyCertificate = learned
@@ -330,7 +330,7 @@ def learners(
     root: Path,
     runs: pd.DataFrame,
     dynamics: AircraftDynamics,
-    family: type[Family] = EnergyCertificate,
+    family: type[Family],
 ) -> list[tuple[Any, Record, Family]]:
     """(run, its record, its certificate, which is of ``family``) of every run.
 
@@ -350,7 +350,7 @@ def learners(
                 f"{record.folder} flew with other_turn = {flown.other_turns[0]:g}, the true unsafe "
                 f"set is that of {dynamics.other_turns[0]:g}: compare it with that of its own task"
             )
-        found.append((run, record, cast("Family", family.from_record(record))))
+        found.append((run, record, family.from_record(record)))
     if lacking:
         raise UserError(
             f"no {POLICY} with {' and '.join(family.arrays)} in {', '.join(lacking)} under "

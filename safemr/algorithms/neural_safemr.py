@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -133,7 +133,7 @@ class NeuralCertificate(Certificate, family="neural"):
     record: Recorded | None = None
 
     @classmethod
-    def from_record(cls, record: Recorded) -> NeuralCertificate:
+    def from_record(cls, record: Recorded) -> Self:
         """The energy that its policy file holds."""
         refuse_other_family(record, cls)
         eta = float(record.hyperparameters.get("eta", 0.0))
@@ -142,7 +142,7 @@ class NeuralCertificate(Certificate, family="neural"):
     @classmethod
     def from_policy(
         cls, policy: Policy, name: str, eta: float = 0.0, record: Recorded | None = None
-    ) -> NeuralCertificate:
+    ) -> Self:
         """The energy that a policy was trained with. Raises UserError where it keeps none."""
         saved = policy.extras
         if lacking := [array for array in cls.arrays if array not in saved]:

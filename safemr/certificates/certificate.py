@@ -14,9 +14,10 @@ An algorithm says ``CERTIFICATE = "mine"`` in its file, and one without that lin
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, Self
 
 from numpy.typing import NDArray
 
@@ -34,9 +35,10 @@ FAMILIES: dict[str, type[Certificate]] = {}  # by name, each entered when its cl
 class Recorded(Protocol):
     """What a family asks of a record (`safemr.experiment.record.Record`)."""
 
-    folder: Any
-    rows: Any
-
+    @property
+    def folder(self) -> Path: ...
+    @property
+    def rows(self) -> Sequence[Mapping[str, float]]: ...
     @property
     def name(self) -> str: ...
     @property
@@ -84,7 +86,7 @@ class Certificate(ABC):
 
     @classmethod
     @abstractmethod
-    def from_record(cls, record: Recorded) -> Certificate:
+    def from_record(cls, record: Recorded) -> Self:
         """The certificate that a recorded run ended with.
 
         Raises UserError where the record's certificate is not of this family. Who does not know the
@@ -138,7 +140,7 @@ class EnergyCertificate(Certificate, family="energy"):
     record: Recorded | None = None
 
     @classmethod
-    def from_record(cls, record: Recorded) -> EnergyCertificate:
+    def from_record(cls, record: Recorded) -> Self:
         """With the last logged sigma, k and n, or those of the policy file where none are logged.
 
         Raises UserError where the record has no energy function, or one that is more than these
