@@ -152,9 +152,10 @@ def test_the_tasks_are_found_beside_another_package(tmp_path: Path) -> None:
 
 def test_the_revision_is_known_in_a_clone_of_another_owner(tmp_path: Path) -> None:
     clone = tmp_path / "clone"
-    (clone / "safemr").mkdir(parents=True)
-    for name in ("__init__", "provenance"):
-        shutil.copy(ROOT / f"safemr/{name}.py", clone / "safemr")
+    (clone / "safemr/experiment").mkdir(parents=True)
+    own = ("__init__", "errors", "files", "experiment/__init__", "experiment/provenance")
+    for name in own:
+        shutil.copy(ROOT / f"safemr/{name}.py", clone / f"safemr/{name}.py")
     identity = ("-c", "user.name=a", "-c", "user.email=a@example.org")
     for arguments in (("init", "-q"), ("add", "."), (*identity, "commit", "-qm", "one")):
         subprocess.run(["git", *arguments], cwd=clone, check=True)
