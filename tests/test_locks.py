@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HOLDER = """
 import sys, time
 from pathlib import Path
-from safemr.locks import ProcessLock
+from safemr.experiment.locks import ProcessLock
 ProcessLock(Path(sys.argv[1]), "works").acquire(wait=False)
 print("held", flush=True)
 time.sleep(60)
