@@ -172,7 +172,7 @@ class Quoted(str):
 def rule_line(run: planning.Run, root: Path, log: Path) -> str:
     """The command of the rule `train`, as Snakemake would give it to bash."""
     text = (ROOT / "workflow/rules/train.smk").read_text().partition("    shell:\n")[2]
-    command: str = ast.literal_eval(f"({text})")
+    command: str = ast.literal_eval(f"({text.partition(chr(10) * 2)[0]})")
     filled = command.format(
         sys=SimpleNamespace(executable=Quoted(sys.executable)),
         params=SimpleNamespace(
@@ -237,7 +237,7 @@ def test_the_last_line_reaches_the_log(started: Any) -> None:
 
 @pytest.mark.parametrize("number", [TERM, INT])
 def test_a_process_that_waits_ends_at_once_with_one_line(number: int, tmp_path: Path) -> None:
-    arguments = ["--task", "Pillars-0.15-Goal", "--algorithm", "fac", "--steps", "1000", "--wait"]
+    arguments = ["--task", "Pillars-0.15-Goal", "--algorithm", "fac", "--steps", "8000", "--wait"]
     from safemr.experiment import train
 
     config, _ = train.resolve(train._parse(arguments))
