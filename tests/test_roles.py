@@ -106,7 +106,7 @@ def test_an_unknown_role_is_one_line(role: Any) -> None:
         assert "did you mean 'method'?" in line
 
 
-@pytest.mark.parametrize("part", ["ROLE", "CERTIFICATE"])
+@pytest.mark.parametrize("part", ["ROLE", "LEARNS"])
 def test_a_module_with_an_unknown_role_is_refused(part: str, monkeypatch) -> None:
     monkeypatch.setattr(f"safemr.algorithms.cpo.{part}", "champion", raising=False)
     with pytest.raises(UserError, match=rf"cpo\.py: {part} must be one of"):
