@@ -38,6 +38,7 @@ OPTIONAL_INFOS = {
     "reward_approach": "0",
     "reward_push": "0",
     "reward_goal": "0",
+    "control_steps": "1",
 }
 
 
@@ -99,7 +100,9 @@ def info_of(infos: Mapping[str, Any], name: str) -> Any:
         return infos[name]
     if name == "cost_contact":
         return info_of(infos, "cost_indicator")
-    return infos["cost"] > 0.0 if name == "cost_indicator" else 0.0
+    if name == "cost_indicator":
+        return infos["cost"] > 0.0
+    return 1.0 if name == "control_steps" else 0.0
 
 
 def check_envs(envs: Any) -> None:

@@ -122,7 +122,12 @@ def test_episodes_have_the_same_columns_with_and_without_optional_infos() -> Non
     ended = np.ones(2, bool)
     bare = {"cost": np.array([0.0, 3.0])}
     zeros = dict.fromkeys(OPTIONAL_INFOS, np.zeros(2))
-    full = zeros | bare | dict.fromkeys(("cost_indicator", "cost_contact"), np.array([0.0, 1.0]))
+    full = (
+        zeros
+        | bare
+        | {"control_steps": np.ones(2)}
+        | dict.fromkeys(("cost_indicator", "cost_contact"), np.array([0.0, 1.0]))
+    )
     rows = []
     for infos in (bare, full):
         statistics = EpisodeStatistics(2)

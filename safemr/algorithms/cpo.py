@@ -5,7 +5,7 @@ Achiam, Held, Tamar & Abbeel, "Constrained policy optimization" (arXiv:1705.1052
     min_x g.x   subject to   c + b.x <= 0   and   x.Hx / 2 <= delta,
 
 g the gradient of -E[r A], b that of the predicted change of an episode's cost, L E[r A_cost] with L
-the episode's length in steps, c = EpCost - cost_limit, H the Fisher matrix, delta = target_kl.
+the episode's length in decisions, c = EpCost - cost_limit, H the Fisher matrix, delta = target_kl.
 
 | equation | function |
 |---|---|
@@ -123,7 +123,7 @@ class Trainer(OnPolicyTrainer):
         c = batch.episode_cost - config.cost_limit
         ratio, _ = ratio_and_kl(self.actor, batch)
         loss = -(ratio * batch.advantages).mean()
-        cost = batch.episode_length * (ratio * batch.cost_advantages).mean()
+        cost = batch.episode_decisions * (ratio * batch.cost_advantages).mean()
         g = self.actor.gradient(loss, retain_graph=True)
         b = self.actor.gradient(cost)
         product = fisher_vector_product(self.actor, batch.observations, config.damping)
@@ -165,7 +165,7 @@ class Trainer(OnPolicyTrainer):
         """
         ratio, kl = ratio_and_kl(self.actor, batch)
         loss = -float((ratio * batch.advantages).mean())
-        cost = batch.episode_length * float((ratio * batch.cost_advantages).mean())
+        cost = batch.episode_decisions * float((ratio * batch.cost_advantages).mean())
         return (
             float(kl) <= self.config.target_kl
             and (case <= 1 or loss <= before[0])

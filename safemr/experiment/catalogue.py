@@ -23,7 +23,7 @@ from safemr.environments import register_tasks
 from safemr.errors import UserError, show
 from safemr.experiment.config import FAMILIES, Variant
 from safemr.experiment.roles import BASELINE, LEARNABLE, NOTHING, OUTSIDE, ROLES, Variants
-from safemr.learning.hyperparameters import unused
+from safemr.learning.hyperparameters import resolved, unused
 from safemr.names import unknown
 
 
@@ -159,7 +159,7 @@ def hyperparameters(
         complete = algorithm.hyperparameters(**values)
     except (UserError, ValueError) as error:
         raise UserError(f"{where}: {error}") from error
-    return dataclasses.asdict(complete)
+    return resolved(complete)
 
 
 def _not_settable(name: str, algorithm: Algorithm, where: str) -> UserError:

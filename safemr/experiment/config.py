@@ -35,6 +35,7 @@ from safemr.experiment.sections import (
 )
 from safemr.experiment.strict_yaml import read_yaml, typed
 from safemr.files import REPOSITORY
+from safemr.learning.interface import Interface
 from safemr.names import unknown
 
 FAMILIES = ("off_policy", "on_policy")
@@ -83,6 +84,7 @@ class TaskOverrides:
     settings: Mapping[str, Any]
     budget: Mapping[str, int]
     hyperparameters: Mapping[str, Mapping[str, Any]]
+    interface: Interface | None  # None: that of all tasks
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,7 @@ class Config:
     budget: Mapping[str, int]
     log_points: int
     evaluation: Evaluation
+    interface: Interface  # how learners meet the tasks of `tasks`, where nothing else is said
     unseen_layouts: UnseenLayouts | None
     task_overrides: Mapping[str, TaskOverrides]
     sensitivity: Sensitivity | None
@@ -189,6 +192,7 @@ def parse(raw: Any) -> Config:
             integer(evaluation.required("episodes"), "evaluation.episodes", 1),
             integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
         ),
+        interface=_interface(top.get("interface"), "interface"),
         unseen_layouts=_unseen(top.get("unseen_layouts")),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
@@ -228,6 +232,7 @@ def parse(raw: Any) -> Config:
 _TOP_LEVEL = (
     *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
     *(
+        "interface",
         "unseen_layouts",
         "sensitivity",
         "aircraft",
@@ -294,7 +299,7 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
 
 
 def _task_overrides(value: Any, where: str) -> TaskOverrides:
-    section = Section(value, where, ("settings", "budget", "hyperparameters"))
+    section = Section(value, where, ("settings", "budget", "hyperparameters", "interface"))
     families = Section(section.get("hyperparameters", {}), f"{where}.hyperparameters", FAMILIES)
     return TaskOverrides(
         mapping(section.get("settings", {}), f"{where}.settings"),
@@ -303,7 +308,14 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
             family: mapping(values, f"{where}.hyperparameters.{family}")
             for family, values in families.value.items()
         },
+        _interface(section.value["interface"], f"{where}.interface")
+        if "interface" in section.value
+        else None,
     )
+
+
+def _interface(value: Any, where: str) -> Interface:
+    return Interface.read(mapping(value or {}, where), where)
 
 
 def _unseen(value: Any) -> UnseenLayouts | None:

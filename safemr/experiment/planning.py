@@ -23,6 +23,7 @@ from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
 from safemr.experiment.roles import Variants
 from safemr.learning.hyperparameters import Setting
+from safemr.learning.interface import Interface
 from safemr.names import unknown
 from safemr.tasks import (
     Described,
@@ -179,8 +180,31 @@ def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
         )
 
 
+def fitted_interface(
+    interface: Interface, task: Mapping[str, Any], where: str = "interface"
+) -> Interface:
+    """An interface checked against a task's environment. Raises UserError where it does not fit."""
+    return _fitted(interface, records.canonical_json(task), where)
+
+
+@functools.cache
+def _fitted(interface: Interface, entry_json: str, where: str) -> Interface:
+    if interface == Interface():
+        return interface
+    envs = make_envs(json.loads(entry_json), 1)
+    try:
+        return interface.fitted(envs, where)
+    finally:
+        envs.close()
+
+
 def check_setting(
-    algorithm: Algorithm, values: Mapping[str, Any], task: Mapping[str, Any], steps: int, where: str
+    algorithm: Algorithm,
+    values: Mapping[str, Any],
+    task: Mapping[str, Any],
+    steps: int,
+    where: str,
+    action_repeat: int = 1,
 ) -> None:
     """Refuse hyperparameters that cannot work on a task, as `describe_task` gives it, in a budget.
 
@@ -192,7 +216,7 @@ def check_setting(
         return
     try:
         has = described(task).traits
-        check(Setting(has.action_dim, has.episode_steps or steps, steps))
+        check(Setting(has.action_dim, has.episode_steps or steps, steps, action_repeat))
     except UserError as error:
         raise UserError(f"{where} on {task['name']}: {error}") from error
 
@@ -207,10 +231,12 @@ def make_run(
     steps: int,
     log_every: int,
     evaluation: Mapping[str, int],
+    interface: Interface | None = None,
 ) -> Run:
-    """A run from its parts: `describe_task`, `load_algorithm` and `hyperparameters`."""
+    """A run from its parts: `describe_task`, `load_algorithm`, `hyperparameters`, and
+    `fitted_interface` where the learner does not meet the environment as it is."""
     described = {"name": algorithm.name, "version": algorithm.version, "hyperparameters": values}
-    return _run(task, described, variant, seed, steps, log_every, evaluation)
+    return _run(task, described, variant, seed, steps, log_every, evaluation, interface)
 
 
 def _run(
@@ -221,6 +247,7 @@ def _run(
     steps: int,
     log_every: int,
     evaluation: Mapping[str, int],
+    interface: Interface | None = None,
 ) -> Run:
     config = {
         "schema": records.SCHEMA,
@@ -231,6 +258,8 @@ def _run(
         "log_every": log_every,
         "evaluation": dict(evaluation),
     }
+    if interface is not None and interface.entry():
+        config["interface"] = interface.entry()
     try:
         records.canonical_json(config)
     except (TypeError, ValueError) as error:
@@ -332,6 +361,7 @@ class _Resolver:
     ) -> Iterator[Run]:
         described = self._task(task, task_section)
         overrides = self.config.task_overrides.get(task)
+        interface = self._interface(task, described)
         for label, variant in variants.items():
             algorithm = load_algorithm(variant.algorithm)
             shared = overrides.hyperparameters.get(algorithm.family, {}) if overrides else {}
@@ -340,7 +370,8 @@ class _Resolver:
             chosen = {k: v for k, v in shared.items() if k in names} | dict(variant.overrides)
             values = hyperparameters(algorithm, chosen, f"{section}.{label}")
             steps = self._steps(task, algorithm.family)
-            check_setting(algorithm, values, described, steps, f"{section}.{label}")
+            where = f"{section}.{label}"
+            check_setting(algorithm, values, described, steps, where, interface.action_repeat)
             for seed in seeds:
                 yield make_run(
                     described,
@@ -349,6 +380,7 @@ class _Resolver:
                     variant=label,
                     seed=seed,
                     steps=steps,
+                    interface=interface,
                     **self._schedule(steps),
                 )
 
@@ -371,6 +403,7 @@ class _Resolver:
     def outside(self) -> Iterator[Run]:
         for task in self.config.tasks:
             described = self._task(task, "tasks")
+            interface = self._interface(task, described)
             for label, entry in self.config.outside.items():
                 algorithm = {
                     "name": entry.algorithm,
@@ -378,8 +411,19 @@ class _Resolver:
                     "hyperparameters": dict(entry.hyperparameters),
                 }
                 for seed in self.config.seeds:
-                    schedule = self._schedule(entry.steps)
+                    schedule = self._schedule(entry.steps) | {"interface": interface}
                     yield _run(described, algorithm, label, seed, entry.steps, **schedule)
+
+    def _interface(self, task: str, described: Mapping[str, Any]) -> Interface:
+        """How learners meet a task: what the configuration says for it, or for all of `tasks`."""
+        overrides = self.config.task_overrides.get(task)
+        if overrides is not None and overrides.interface is not None:
+            asked, where = overrides.interface, f"task_overrides.{task}.interface"
+        else:  # the aircraft is met as it is
+            part = self.config.sensitivity
+            shared = task in self.config.tasks or (part is not None and task == part.task)
+            asked, where = self.config.interface if shared else Interface(), "interface"
+        return fitted_interface(asked, described, where)
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
         """The entry of a task by its name in the configuration."""

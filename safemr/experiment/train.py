@@ -9,7 +9,6 @@ the algorithm, this file evaluates, records, checkpoints and resumes; the algori
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 import sys
 import time
@@ -18,13 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from safemr.conventions import EVALUATION_SEED
-from safemr.environments import check_envs
+from safemr.environments import SafetyEnvs, check_envs
 from safemr.errors import UserError, tell
 from safemr.experiment import planning, records
 from safemr.experiment.config import WANDB_MODES
 from safemr.experiment.sections import checked_name
 from safemr.experiment.signals import StoppedError, StopSignals
 from safemr.experiment.strict_yaml import assignment
+from safemr.learning.interface import Interface
 from safemr.tasks import make_envs
 
 if TYPE_CHECKING:
@@ -93,9 +93,13 @@ def train(
             "or resolve the configuration anew"
         )
     steps, log_every, evaluation = config["steps"], config["log_every"], config["evaluation"]
-    environments = functools.partial(make_envs, config["task"])
-    evaluation_envs = environments(evaluation["episodes"])
+    evaluation_envs = make_envs(config["task"], evaluation["episodes"])
     check_envs(evaluation_envs)
+    interface = Interface.read(config.get("interface")).fitted(evaluation_envs)
+
+    def environments(num_envs: int) -> SafetyEnvs:
+        return interface.around(make_envs(config["task"], num_envs))
+
     hyperparameters = algorithm.hyperparameters(**described["hyperparameters"])
     trainer = algorithm.trainer(hyperparameters, environments, config["seed"], steps)
     state = session.resume()
@@ -146,7 +150,8 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="override a hyperparameter; task.NAME=VALUE is a setting of the environment",
+        help="override a hyperparameter; task.NAME=VALUE is a setting of the environment, "
+        "interface.NAME=VALUE one of how the learner meets it",
     )
     parser.add_argument("--log-points", type=int, default=20, help="rows of progress.csv")
     parser.add_argument("--eval-episodes", type=int, default=10)
@@ -185,16 +190,22 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
     overrides = dict(map(assignment, arguments.set))
-    settings = {
-        name.removeprefix("task."): overrides.pop(name)
-        for name in list(overrides)
-        if name.startswith("task.")
-    }
+    settings, asked = (
+        {
+            name.removeprefix(prefix): overrides.pop(name)
+            for name in list(overrides)
+            if name.startswith(prefix)
+        }
+        for prefix in ("task.", "interface.")
+    )
     task = _task(arguments, settings)
+    interface = planning.fitted_interface(Interface.read(asked, "--set interface"), task)
     algorithm = planning.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
     values = planning.hyperparameters(algorithm, overrides, "--set")
-    planning.check_setting(algorithm, values, task, arguments.steps, arguments.algorithm)
+    planning.check_setting(
+        algorithm, values, task, arguments.steps, arguments.algorithm, interface.action_repeat
+    )
     run = planning.make_run(
         task,
         algorithm,
@@ -202,6 +213,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         variant=arguments.variant or arguments.algorithm,
         seed=arguments.seed,
         steps=arguments.steps,
+        interface=interface,
         log_every=log_every,
         evaluation={
             "every": log_every,

@@ -6,7 +6,7 @@ and a saved policy can never disagree about it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,7 +38,25 @@ BLOCKS: Mapping[str, Block] = {
     "position": Block(None, 0.1),
 }
 
+LIDAR_BINS = 16
+DECODED = 4  # numbers that stand for a decoded lidar
+
 UNREAD_TAIL = 1  # columns after the last one read: the vertical component of a layout's last sensor
+
+
+def decoded(readings: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Bearing and distance of the one object that a lidar sees: [..., 16] -> [..., 4].
+
+    An object at distance d [m] in direction (i + f) 2 pi / 16, 0 <= f < 1, leaves e^-d in bin i,
+    f e^-d in the bin after it and (1 - f) e^-d in the one before (`envs.navigation_kernels`). So
+    cos and sin of the bearing, d - 1 and e^-d are the same information.
+    """
+    nearest = readings.argmax(-1)[..., None]
+    signal = np.take_along_axis(readings, nearest, -1)
+    after = np.take_along_axis(readings, (nearest + 1) % LIDAR_BINS, -1)
+    bearing = (nearest + after / signal) * (2.0 * np.pi / LIDAR_BINS)
+    parts = (np.cos(bearing), np.sin(bearing), -np.log(signal) - 1.0, signal)
+    return np.concatenate(parts, -1)
 
 
 class ObservationTransform:
@@ -46,7 +64,8 @@ class ObservationTransform:
 
     columns [dim] int64, scale [dim] and clip [dim] float32. Calling it maps [N, obs] (any float
     type, any order in memory) to float32 [N, dim] in Fortran order. width is the raw observations'
-    number of columns, which a saved policy does not say.
+    number of columns, which a saved policy does not say unless it decodes: ``lidars`` are the first
+    columns of decoded lidars, and columns from width on are those of `decoded`, lidar by lidar.
     """
 
     def __init__(
@@ -55,27 +74,41 @@ class ObservationTransform:
         scale: NDArray[np.float32],
         clip: NDArray[np.float32],
         width: int | None = None,
+        lidars: tuple[int, ...] = (),
     ) -> None:
         self.columns, self.scale, self.clip, self.width = columns, scale, clip, width
+        self.lidars = lidars
         self._clipped = np.flatnonzero(np.isfinite(clip))
 
     @classmethod
-    def for_layout(cls, layout: Mapping[str, slice]) -> ObservationTransform:
-        """For an environment's ``observation_layout``; an unlisted sensor is kept as it is."""
+    def for_layout(
+        cls, layout: Mapping[str, slice], decode: Iterable[str] = ()
+    ) -> ObservationTransform:
+        """For an environment's ``observation_layout``; an unlisted sensor is kept as it is.
+
+        ``decode`` names lidars of a single object, of which `decoded` stands in the place.
+        """
+        total = max(part.stop for part in layout.values())
+        lidars = tuple(layout[name].start for name in layout if name in set(decode))
         columns: list[int] = []
         scale: list[float] = []
         clip: list[float] = []
         for name, part in layout.items():
             block = BLOCKS.get(name, Block())
-            width = range(part.stop - part.start) if block.columns is None else block.columns
-            columns += [part.start + column for column in width]
+            start, width = part.start, range(part.stop - part.start)
+            if start in lidars:
+                start, width = total + DECODED * lidars.index(start), range(DECODED)
+            elif block.columns is not None:
+                width = block.columns
+            columns += [start + column for column in width]
             scale += [block.scale] * len(width)
             clip += [block.clip] * len(width)
         return cls(
             np.array(columns, np.int64),
             np.array(scale, np.float32),
             np.array(clip, np.float32),
-            max(part.stop for part in layout.values()),
+            total,
+            lidars,
         )
 
     @property
@@ -99,6 +132,9 @@ class ObservationTransform:
         # type and order in memory are decided: float32, one column after another, which is what
         # NumPy makes of an index array behind an ellipsis. In another order products round
         # otherwise on some processors, and recorded runs would not be repeated.
+        if self.lidars:
+            parts = [decoded(observations[..., at : at + LIDAR_BINS]) for at in self.lidars]
+            observations = np.concatenate((observations, *parts), -1)
         out = observations[..., self.columns].astype(np.float32)
         out *= self.scale
         if len(self._clipped):

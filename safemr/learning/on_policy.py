@@ -20,6 +20,7 @@ from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, g
 from safemr.learning.episode_statistics import EpisodeStatistics
 from safemr.learning.gaussian import GaussianActor, entropy, kl_divergence, log_density
 from safemr.learning.hyperparameters import Hyperparameters, Setting
+from safemr.learning.interface import interface_of
 from safemr.learning.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
@@ -38,17 +39,22 @@ PUBLISHED: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class OnPolicyConfig(Hyperparameters):
-    """What the on-policy algorithms share. Steps are environment steps."""
+    """What the on-policy algorithms share.
+
+    A sample is a decision: an action held for the interface's ``action_repeat`` control steps
+    (`safemr.learning.interface`), usually one.
+    """
 
     cost_limit: float = 0.0  # of an episode's undiscounted cost
-    gamma: float = 0.99  # discount of the reward; below 1, as time limits are bootstrapped through
-    cost_gamma: float = 0.99  # discount of the cost
+    # discount of the reward, a decision; below 1, as time limits are bootstrapped through
+    gamma: float = 0.99
+    cost_gamma: float = 0.99  # discount of the cost, a decision
     gae_lambda: float = 0.97  # lambda of the reward's generalised advantages (GAE)
     cost_gae_lambda: float = 0.97  # lambda of the cost's
     target_kl: float = 0.01  # PPO: stop beyond kl_stop times it; trust region: its radius
 
     num_envs: int = 8  # environments stepped together
-    epoch_steps: int = 8_000  # between two updates, over all environments
+    epoch_steps: int = 8_000  # control steps between two updates, over all environments
 
     hidden: int = 64  # units of each of the two hidden layers
     activation: Activation = "tanh"  # of the hidden layers
@@ -85,6 +91,12 @@ class OnPolicyConfig(Hyperparameters):
             self.epoch_steps <= setting.total_steps,
             f"must not exceed the budget of {setting.total_steps} steps",
         )
+        stride = self.num_envs * setting.action_repeat
+        self.require(
+            "epoch_steps",
+            self.epoch_steps % stride == 0,
+            f"must be a multiple of num_envs x action_repeat = {stride}",
+        )
 
 
 @dataclass(frozen=True)
@@ -100,7 +112,7 @@ class Batch:
     cost_advantages: Tensor  # [B], centred
     returns: Tensor  # [2, B], discounted reward and cost to go
     episode_cost: float  # EpCost, see `OnPolicyTrainer.episode_cost`
-    episode_length: float  # its length in steps
+    episode_decisions: float  # its length in decisions
 
     def select(self, indices: Tensor | slice) -> Batch:
         """The samples of a minibatch."""
@@ -116,7 +128,7 @@ class Batch:
             self.cost_advantages[indices],
             self.returns[:, indices],
             self.episode_cost,
-            self.episode_length,
+            self.episode_decisions,
         )
 
 
@@ -143,7 +155,10 @@ class OnPolicyTrainer(ABC):
     ) -> None:
         self.config, self.step = config, 0
         self.envs = make_envs(config.num_envs)
-        self.transform = ObservationTransform.for_layout(self.envs.observation_layout)
+        self.interface = interface_of(self.envs)
+        self.transform = ObservationTransform.for_layout(
+            self.envs.observation_layout, self.interface.decode
+        )
         inputs, actions = self.transform.dim, int(np.prod(self.envs.single_action_space.shape))
         sizes, weights = (inputs, config.hidden, config.hidden), generator(seed, 0)
         network = StackedMLP(
@@ -156,7 +171,10 @@ class OnPolicyTrainer(ABC):
         )
         self.noise, self.order = generator(seed, 1), generator(seed, 2)
         self.rollout = Rollout(
-            config.epoch_steps // config.num_envs, config.num_envs, inputs, actions
+            config.epoch_steps // (config.num_envs * self.interface.action_repeat),
+            config.num_envs,
+            inputs,
+            actions,
         )
         self.statistics = EpisodeStatistics(config.num_envs)
         self.observations, _ = self.envs.reset(seed=environment_seed(seed, 3))
@@ -165,7 +183,11 @@ class OnPolicyTrainer(ABC):
     def policy(self) -> Policy:
         """The current policy; it follows further training."""
         return Policy(
-            self.transform, self.actor.network, squash=False, log_std=self.actor.log_std.detach()
+            self.transform,
+            self.actor.network,
+            squash=False,
+            log_std=self.actor.log_std.detach(),
+            interface=self.interface,
         )
 
     @abstractmethod
@@ -196,7 +218,7 @@ class OnPolicyTrainer(ABC):
     def _collect(self) -> tuple[Batch, dict[str, float]]:
         """One rollout with the current policy, and its advantages."""
         config, rollout = self.config, self.rollout
-        episodes_before = len(self.statistics.finished)
+        episodes_before, steps = len(self.statistics.finished), 0
         rollout.clear()
         std = self.actor.log_std.detach().exp()
         noise = std * torch.randn(rollout.actions.shape, generator=self.noise)
@@ -208,15 +230,16 @@ class OnPolicyTrainer(ABC):
                     actions.numpy()
                 )
                 self.statistics.update(rewards, terminated, truncated, infos)
+                steps += int(np.sum(infos.get("control_steps", config.num_envs)))
                 finals = None
                 if truncated.any():
                     finals = torch.from_numpy(self.transform(infos["final_obs"]))
                 rollout.add(inputs, actions, rewards, infos["cost"], terminated, truncated, finals)
             rollout.close(torch.from_numpy(self.transform(self.observations)))
-        self.step += config.epoch_steps
-        return self._batch(episodes_before)
+        self.step += steps
+        return self._batch(episodes_before, steps)
 
-    def _batch(self, episodes_before: int) -> tuple[Batch, dict[str, float]]:
+    def _batch(self, episodes_before: int, steps: int) -> tuple[Batch, dict[str, float]]:
         config, rollout = self.config, self.rollout
         values, following = rollout.values(self.critics)
         advantages, returns = np.empty_like(values), np.empty_like(values)
@@ -239,7 +262,7 @@ class OnPolicyTrainer(ABC):
             mean = self.actor.mean(observations)
             log_std = self.actor.log_std.detach().clone()
             densities = log_density(actions, mean, log_std)
-        episode_cost, episode_length = self.episode_cost(episodes_before)
+        episode_cost, episode_length = self.episode_cost(episodes_before, steps)
         batch = Batch(
             observations,
             actions,
@@ -250,7 +273,7 @@ class OnPolicyTrainer(ABC):
             cost_advantages,
             torch.from_numpy(returns).float(),
             episode_cost,
-            episode_length,
+            episode_length * len(actions) / steps,
         )
         metrics = {"epoch_cost": episode_cost}
         for name, prediction, target in zip(("reward", "cost"), values, returns, strict=True):
@@ -259,15 +282,15 @@ class OnPolicyTrainer(ABC):
                 metrics[f"explained_variance_{name}"] = share
         return batch, metrics
 
-    def episode_cost(self, episodes_before: int) -> tuple[float, float]:
+    def episode_cost(self, episodes_before: int, steps: int) -> tuple[float, float]:
         """EpCost and episode length: means over the episodes that finished in this epoch.
 
-        In an epoch without one, the epoch's cost a step times the time limit, which has the same
-        mean where episodes end by their time limit only.
+        In an epoch without one, the epoch's cost a control step (of ``steps``) times the time
+        limit, which has the same mean where episodes end by their time limit only.
         """
         finished = self.statistics.finished[episodes_before:]
         if len(finished) == 0:
-            rate = float(self.rollout.signals[1].mean())
+            rate = float(self.rollout.signals[1].sum()) / steps
             return rate * self.envs.max_episode_steps, float(self.envs.max_episode_steps)
         names = self.statistics.names
         means = finished.mean(0)
