@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, evaluation_seed, unseen_seed
 from safemr.errors import UserError, show
 from safemr.experiment.roles import ROLES
 from safemr.experiment.sections import (
@@ -177,6 +177,8 @@ def parse(raw: Any) -> Config:
     wandb = Section(top.get("wandb", {}), "wandb", ("mode", "project"))
     safe = Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
     tasks = _tasks(top.required("tasks"), "tasks")
+    seeds = seeds_in(top.required("seeds"), "seeds")
+    least = min(seeds)  # decides whose layouts those are that are not named
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
         raise unknown("wandb mode", mode, WANDB_MODES)
@@ -184,16 +186,18 @@ def parse(raw: Any) -> Config:
         tasks=tuple(tasks),
         task_variants={name: variant for name, variant in tasks.items() if variant},
         algorithms=_variants(top.required("algorithms"), "algorithms"),
-        seeds=seeds_in(top.required("seeds"), "seeds"),
+        seeds=seeds,
         budget=_budget(top.required("budget"), "budget"),
         log_points=integer(top.get("log_points", 50), "log_points", 1),
         evaluation=Evaluation(
             integer(evaluation.required("points"), "evaluation.points", 1),
             integer(evaluation.required("episodes"), "evaluation.episodes", 1),
-            integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
+            integer(
+                evaluation.get("seed", evaluation_seed(least)), "evaluation.seed", 0, LARGEST_SEED
+            ),
         ),
         interface=_interface(top.get("interface"), "interface"),
-        unseen_layouts=_unseen(top.get("unseen_layouts")),
+        unseen_layouts=_unseen(top.get("unseen_layouts"), least),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
             for name, value in labelled(top.get("task_overrides", {}), "task_overrides")
@@ -318,13 +322,13 @@ def _interface(value: Any, where: str) -> Interface:
     return Interface.read(mapping(value or {}, where), where)
 
 
-def _unseen(value: Any) -> UnseenLayouts | None:
+def _unseen(value: Any, least: int) -> UnseenLayouts | None:
     if not value and (value is None or isinstance(value, Mapping)):
         return None
     section = Section(value, "unseen_layouts", ("episodes", "seed"))
     return UnseenLayouts(
         integer(section.required("episodes"), "unseen_layouts.episodes", 1),
-        integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
+        integer(section.get("seed", unseen_seed(least)), "unseen_layouts.seed", 0, LARGEST_SEED),
     )
 
 

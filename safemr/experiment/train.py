@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from safemr.conventions import EVALUATION_SEED
+from safemr.conventions import evaluation_seed
 from safemr.environments import SafetyEnvs, check_envs
 from safemr.errors import UserError, tell
 from safemr.experiment import planning, records
@@ -155,7 +155,9 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--log-points", type=int, default=20, help="rows of progress.csv")
     parser.add_argument("--eval-episodes", type=int, default=10)
-    parser.add_argument("--eval-seed", type=int, default=EVALUATION_SEED)
+    parser.add_argument(
+        "--eval-seed", type=int, help="first layout (default: that of reported or of tuning seeds)"
+    )
     parser.add_argument(
         "--resolved", help="a run's complete configuration as JSON, or a file of it"
     )
@@ -186,6 +188,8 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         return config, arguments.variant or name
     if not arguments.task or not arguments.algorithm:
         raise UserError("give --task and --algorithm (or --resolved)")
+    if arguments.eval_seed is None:
+        arguments.eval_seed = evaluation_seed(arguments.seed)
     for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
