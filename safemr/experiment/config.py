@@ -84,7 +84,7 @@ class TaskOverrides:
     settings: Mapping[str, Any]
     budget: Mapping[str, int]
     hyperparameters: Mapping[str, Mapping[str, Any]]
-    interface: Interface | None  # None: that of all tasks
+    interface: Interface | None  # None: that of `tasks`
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def parse(raw: Any) -> Config:
             integer(evaluation.required("episodes"), "evaluation.episodes", 1),
             integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
         ),
-        interface=_interface(top.get("interface"), "interface"),
+        interface=Interface.read(top.get("interface")),
         unseen_layouts=_unseen(top.get("unseen_layouts")),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
@@ -230,9 +230,9 @@ def parse(raw: Any) -> Config:
 
 
 _TOP_LEVEL = (
-    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
+    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "interface"),
     *(
-        "interface",
+        "task_overrides",
         "unseen_layouts",
         "sensitivity",
         "aircraft",
@@ -308,14 +308,10 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
             family: mapping(values, f"{where}.hyperparameters.{family}")
             for family, values in families.value.items()
         },
-        _interface(section.value["interface"], f"{where}.interface")
+        Interface.read(section.value["interface"], f"{where}.interface")
         if "interface" in section.value
         else None,
     )
-
-
-def _interface(value: Any, where: str) -> Interface:
-    return Interface.read(mapping(value or {}, where), where)
 
 
 def _unseen(value: Any) -> UnseenLayouts | None:

@@ -183,7 +183,11 @@ def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
 def fitted_interface(
     interface: Interface, task: Mapping[str, Any], where: str = "interface"
 ) -> Interface:
-    """An interface checked against a task's environment. Raises UserError where it does not fit."""
+    """An interface as it is on a task: its lidars named, the fit with the environment checked.
+
+    Raises:
+        UserError: it does not fit; naming ``where`` and the task.
+    """
     return _fitted(interface, records.canonical_json(task), where)
 
 
@@ -191,9 +195,12 @@ def fitted_interface(
 def _fitted(interface: Interface, entry_json: str, where: str) -> Interface:
     if interface == Interface():
         return interface
-    envs = make_envs(json.loads(entry_json), 1)
+    entry = json.loads(entry_json)
+    envs = make_envs(entry, 1)
     try:
         return interface.fitted(envs, where)
+    except UserError as error:
+        raise UserError(f"task {name_of(entry)}: {error}") from error
     finally:
         envs.close()
 
@@ -339,7 +346,7 @@ class _Resolver:
         for task in config.task_variants:
             self._task(task, f"tasks.{task}")
         for task, overrides in config.task_overrides.items():
-            self._task(task, "task_overrides")
+            self._interface(task, self._task(task, "task_overrides"))
             for family, values in overrides.hyperparameters.items():
                 names = {
                     name
