@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import datetime
+import importlib
 import math
 from pathlib import Path
 from typing import Any
@@ -590,7 +591,7 @@ def test_equal_settings_have_equal_digests() -> None:
 
 def test_version_bumps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     before = {run.path for run in resolve(VALID).runs}
-    module = planning.importlib.import_module("safemr.algorithms.ppo_lagrangian")
+    module = importlib.import_module("safemr.algorithms.ppo_lagrangian")
     monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
     planning.load_algorithm.cache_clear()
     after = {run.path for run in resolve(VALID).runs}
