@@ -84,7 +84,7 @@ class TaskOverrides:
     settings: Mapping[str, Any]
     budget: Mapping[str, int]
     hyperparameters: Mapping[str, Mapping[str, Any]]
-    interface: Interface | None  # None: that of all tasks
+    interface: Interface | None  # None: that of `tasks`
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def parse(raw: Any) -> Config:
                 evaluation.get("seed", evaluation_seed(least)), "evaluation.seed", 0, LARGEST_SEED
             ),
         ),
-        interface=_interface(top.get("interface"), "interface"),
+        interface=Interface.read(top.get("interface")),
         unseen_layouts=_unseen(top.get("unseen_layouts"), least),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
@@ -234,9 +234,9 @@ def parse(raw: Any) -> Config:
 
 
 _TOP_LEVEL = (
-    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
+    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "interface"),
     *(
-        "interface",
+        "task_overrides",
         "unseen_layouts",
         "sensitivity",
         "aircraft",
@@ -312,14 +312,10 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
             family: mapping(values, f"{where}.hyperparameters.{family}")
             for family, values in families.value.items()
         },
-        _interface(section.value["interface"], f"{where}.interface")
+        Interface.read(section.value["interface"], f"{where}.interface")
         if "interface" in section.value
         else None,
     )
-
-
-def _interface(value: Any, where: str) -> Interface:
-    return Interface.read(mapping(value or {}, where), where)
 
 
 def _unseen(value: Any, least: int) -> UnseenLayouts | None:

@@ -64,7 +64,10 @@ def _costs(recorded: Iterable[Record]) -> Iterator[Cost]:
 
 
 def _estimate(run: Run, known: Sequence[Cost]) -> float | None:
-    """CPU seconds of a run: the mean a step of the most similar algorithm recorded on its task."""
+    """CPU seconds of a run: the mean a step of the most similar algorithm recorded on its task.
+
+    All runs of a plan meet a task through one interface, so a decision takes as many steps.
+    """
     algorithm = run.config["algorithm"]
     names = set(algorithm["hyperparameters"])
 

@@ -203,7 +203,8 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         for prefix in ("task.", "interface.")
     )
     task = _task(arguments, settings)
-    interface = planning.fitted_interface(Interface.read(asked, "--set interface"), task)
+    where = "--set interface"
+    interface = planning.fitted_interface(Interface.read(asked, where), task, where)
     algorithm = planning.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
     values = planning.hyperparameters(algorithm, overrides, "--set")

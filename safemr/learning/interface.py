@@ -49,24 +49,32 @@ class Interface:
             raise UserError(
                 f"action_scale must be numbers in (0, 1], not {show(list(self.action_scale))}"
             )
+        # An entry's text and with it a run's digest depend on the type; 1 and 1.0 are the same.
+        object.__setattr__(self, "action_scale", tuple(map(float, self.action_scale)))
         if len(set(self.decode)) < len(self.decode):
             raise UserError(f"decode names a lidar twice: {show(list(self.decode))}")
 
     @classmethod
-    def read(cls, entry: Mapping[str, Any] | None, where: str = "interface") -> Interface:
-        """From its entry in a configuration.
+    def read(cls, entry: Any, where: str = "interface") -> Interface:
+        """From its entry in a configuration; None is the environment as it is.
 
         Raises:
             UserError: naming ``where`` and what is wrong.
         """
-        entry = dict(entry or {})
+        if entry is None:
+            return cls()
+        if not isinstance(entry, Mapping):
+            raise UserError(f"{where} must be a mapping, not {show(entry)}")
         names = [field.name for field in dataclasses.fields(cls)]
         for name in entry:
             if name not in names:
                 raise unknown("setting", name, names, where)
         scale, decode = entry.get("action_scale", ()), entry.get("decode", ())
         if not _is_list(scale) or not all(_is_number(value) for value in scale):
-            raise UserError(f"{where}.action_scale must be a list of numbers, not {show(scale)}")
+            raise UserError(
+                f"{where}.action_scale must be a list of one number in (0, 1] for each component "
+                f"of an action, not {show(scale)}"
+            )
         if decode == SINGLE:
             decode = (SINGLE,)
         if not _is_list(decode) or not all(isinstance(name, str) for name in decode):
@@ -74,11 +82,9 @@ class Interface:
                 f"{where}.decode must be a list of lidars or {SINGLE!r}, not {show(decode)}"
             )
         try:
-            return cls(
-                entry.get("action_repeat", 1), tuple(float(value) for value in scale), tuple(decode)
-            )
+            return cls(entry.get("action_repeat", 1), tuple(scale), tuple(decode))
         except UserError as error:
-            raise UserError(f"{where}: {error}") from error
+            raise UserError(f"{where}.{error}") from error
 
     def fitted(self, envs: Any, where: str = "interface") -> Interface:
         """The same with every lidar named, checked against an environment, scalar or batched.
@@ -98,14 +104,14 @@ class Interface:
         components = math.prod(space.shape)
         if self.action_scale and len(self.action_scale) != components:
             raise UserError(
-                f"{where}.action_scale has {len(self.action_scale)} numbers for actions of "
-                f"{components} components"
+                f"{where}.action_scale must have {components} numbers, one for each component of "
+                f"an action, not {len(self.action_scale)}"
             )
         limit = envs.max_episode_steps
         if limit is not None and self.action_repeat > limit:
             raise UserError(
-                f"{where}.action_repeat = {self.action_repeat} exceeds the {limit} steps of an "
-                "episode"
+                f"{where}.action_repeat = {self.action_repeat}: must not exceed the {limit} steps "
+                "of an episode"
             )
         return dataclasses.replace(self, decode=decode)
 

@@ -38,7 +38,7 @@ BLOCKS: Mapping[str, Block] = {
     "position": Block(None, 0.1),
 }
 
-LIDAR_BINS = 16
+BINS = 16  # of a lidar
 DECODED = 4  # numbers that stand for a decoded lidar
 
 UNREAD_TAIL = 1  # columns after the last one read: the vertical component of a layout's last sensor
@@ -53,8 +53,8 @@ def decoded(readings: NDArray[np.floating]) -> NDArray[np.floating]:
     """
     nearest = readings.argmax(-1)[..., None]
     signal = np.take_along_axis(readings, nearest, -1)
-    after = np.take_along_axis(readings, (nearest + 1) % LIDAR_BINS, -1)
-    bearing = (nearest + after / signal) * (2.0 * np.pi / LIDAR_BINS)
+    after = np.take_along_axis(readings, (nearest + 1) % BINS, -1)
+    bearing = (nearest + after / signal) * (2.0 * np.pi / BINS)
     parts = (np.cos(bearing), np.sin(bearing), -np.log(signal) - 1.0, signal)
     return np.concatenate(parts, -1)
 
@@ -95,14 +95,15 @@ class ObservationTransform:
         clip: list[float] = []
         for name, part in layout.items():
             block = BLOCKS.get(name, Block())
-            start, width = part.start, range(part.stop - part.start)
+            start = part.start
+            width: Iterable[int] = range(part.stop - start)
             if start in lidars:
                 start, width = total + DECODED * lidars.index(start), range(DECODED)
             elif block.columns is not None:
                 width = block.columns
             columns += [start + column for column in width]
-            scale += [block.scale] * len(width)
-            clip += [block.clip] * len(width)
+            scale += [block.scale] * (len(columns) - len(scale))
+            clip += [block.clip] * (len(columns) - len(clip))
         return cls(
             np.array(columns, np.int64),
             np.array(scale, np.float32),
@@ -133,7 +134,7 @@ class ObservationTransform:
         # NumPy makes of an index array behind an ellipsis. In another order products round
         # otherwise on some processors, and recorded runs would not be repeated.
         if self.lidars:
-            parts = [decoded(observations[..., at : at + LIDAR_BINS]) for at in self.lidars]
+            parts = [decoded(observations[..., at : at + BINS]) for at in self.lidars]
             observations = np.concatenate((observations, *parts), -1)
         out = observations[..., self.columns].astype(np.float32)
         out *= self.scale

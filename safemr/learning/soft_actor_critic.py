@@ -79,7 +79,7 @@ class SoftActorCriticConfig(Hyperparameters):
     # it falls linearly to 0
     explore_share: float = 0.0
     explore_hold_min: int = 3  # least number of decisions for which it is held
-    explore_hold_max: int = 15  # largest
+    explore_hold_max: int = 15  # largest number
     explore_until: float = 0.8  # share of the run's steps at which the probability is 0
     device: str = "cpu"  # PyTorch's name of the device that learns
     backend: Literal["fused", "torch"] = "fused"  # numba's kernels (CPU only), or PyTorch
