@@ -50,6 +50,8 @@ class Recorded(Protocol):
     @property
     def hyperparameters(self) -> Mapping[str, Any]: ...
     @property
+    def interface(self) -> Any: ...
+    @property
     def has_policy(self) -> bool: ...
     def policy_arrays(self) -> Arrays: ...
     def policy(self) -> Any: ...
@@ -112,7 +114,7 @@ class Certificate(ABC):
         """
 
     def constraint(self, phi: NDArray[Any], phi_next: NDArray[Any]) -> NDArray[Any]:
-        """g [...] of phi before and after a step, kept where g < 0 (Eq. cstr0)."""
+        """g [...] of phi before and after a decision, kept where g < 0 (Eq. cstr0)."""
         return energy.constraint(phi, phi_next, self.eta)
 
 

@@ -12,6 +12,7 @@ from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.errors import UserError
 from safemr.experiment import records
 from safemr.files import POLICY, Arrays, policy_arrays
+from safemr.learning.interface import Interface
 from safemr.paper import Zeta
 
 if TYPE_CHECKING:
@@ -57,6 +58,11 @@ class Record:
     @property
     def hyperparameters(self) -> Mapping[str, Any]:
         return self.config["algorithm"].get("hyperparameters", {})
+
+    @property
+    def interface(self) -> Interface:
+        """How the learner met its task. Raises UserError where the configuration's is none."""
+        return Interface.read(self.config.get("interface"), f"{self.folder}: interface")
 
     @property
     def name(self) -> str:

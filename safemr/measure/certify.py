@@ -4,11 +4,13 @@ Three questions, kept apart: does the analytic condition (*) hold (four verdicts
 `safemr.certificates.feasibility`); does a dense search find states without a safe action
 (`safemr.certificates.falsification`); and does a trained policy pick violating actions although
 safe ones exist. The certificate is given by its parameters, by a run record, or, with neither, is
-each one that the paper prints.
+each one that the paper prints. A record's is checked over its own decisions, as long and as large
+as the interface of the run makes them; one without a record over single control steps.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,9 +25,9 @@ from safemr.certificates.certificate import EnergyCertificate, Recorded
 from safemr.certificates.feasibility import analytic_condition
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
+from safemr.learning.interface import Interface
 from safemr.measure.policy_check import check_policy
 from safemr.measure.store import Measurements
-from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
 
 DEFAULT_TASK = paper.SENSITIVITY_TASK  # Table II's
@@ -54,6 +56,15 @@ def certificate_of_record(folder: Path) -> tuple[EnergyCertificate, dict[str, An
     return EnergyCertificate.from_record(record).in_metres(), record.task
 
 
+def decisions_of(certificate: EnergyCertificate) -> Interface:
+    """How long and how large the actions are over which a certificate is to hold.
+
+    The environment's own where it has no record.
+    """
+    interface: Interface = certificate.record.interface if certificate.record else Interface()
+    return dataclasses.replace(interface, decode=())
+
+
 def certify(
     certificate: EnergyCertificate,
     task: Task = DEFAULT_TASK,
@@ -66,14 +77,19 @@ def certify(
 
     The row: certificate, task, sigma, k, n, eta, the margins of the four analytic verdicts [m/s^2],
     states searched, infeasible and leak share, worst margin, verdicts shared by the simulator, and,
-    with a policy, its violating and avoidable shares in `episodes` episodes, of whose violating
-    steps at most 8 an episode are searched for a safe action.
+    with a policy, its decisions (``policy_steps``) and their violating and avoidable shares in
+    `episodes` episodes, of whose violating decisions at most 8 an episode are searched for a safe
+    action. Where a decision is not one control step, ``action_repeat`` says how many.
     """
     certificate = certificate.in_metres()
+    interface = decisions_of(certificate)
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
     analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
-    search = falsification.falsify(envs, task, zeta, eta=eta, count=states, seed=seed)
+    search = falsification.falsify(
+        envs, task, zeta, eta=eta, count=states, seed=seed,
+        action_repeat=interface.action_repeat, action_scale=interface.action_scale,
+    )  # fmt: skip
     envs.close()
     row: dict[str, Any] = {
         "certificate": certificate.name, "task": name_of(task), **zeta._asdict(), "eta": eta,
@@ -82,13 +98,15 @@ def certify(
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
         "simulator_agrees": f"{search.confirmed}/{search.examined}",
     }  # fmt: skip
+    if interface.action_repeat != 1:
+        row["action_repeat"] = interface.action_repeat
     if (record := trained_policy(certificate)) is not None:
         check = check_policy(
             record.policy(), task, zeta, eta=eta, num_envs=episodes, seed=seed,
-            limit=8 * episodes,
+            limit=8 * episodes, action_scale=interface.action_scale,
         )  # fmt: skip
         row |= {
-            "policy_steps": check.steps,
+            "policy_steps": check.decisions,
             "policy_violating_share": check.violating_share,
             "policy_avoidable_share": check.avoidable_share,
         }
@@ -111,6 +129,7 @@ def measured_certificate(
         "task": installed(task),
         "states": states, "episodes": episodes,
         "policy": record and record.inputs,
+        **_inputs(certificate),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
@@ -129,10 +148,11 @@ def measured_margins(
     inputs = {
         "zeta": list(certificate.zeta), "eta": certificate.eta,
         "task": installed(task),
+        **_inputs(certificate),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
-        margins = margin_map(task, certificate.zeta, eta=certificate.eta)
+        margins = margin_map(certificate, task)
         columns = {name: margins[name].to_numpy() for name in margins}
         return columns | {"d_min": np.array(contact_distance(task))}
 
@@ -142,17 +162,19 @@ def measured_margins(
 
 
 def margin_map(
-    task: Task, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
+    certificate: EnergyCertificate, task: Task, *, distances: int = 37, bearings: int = 37
 ) -> pd.DataFrame:
     """Best margin of the least favourable motion at each distance and bearing.
 
     The maximum over courses within 0.4 rad of the obstacle, three speeds and three turn rates of
-    the least g over the action grid. Returns distance, bearing, margin; nan where the robot would
-    overlap the obstacle. Positive: from some such motion no action is safe.
+    the least g over the action grid, held for a decision. Returns distance, bearing, margin; nan
+    where the robot would overlap the obstacle. Positive: from some such motion no action is safe.
     """
+    certificate, interface = certificate.in_metres(), decisions_of(certificate)
+    zeta, held = certificate.zeta, (interface.action_repeat, interface.action_scale)
     envs = falsification.make_simulator(task, 1)
     robot, d_min = falsification.ROBOT, float(envs.d_min)
-    reach = falsification.largest_distance(zeta, d_min)
+    reach = falsification.largest_distance(zeta, d_min, interface.action_repeat)
     turn_rates = robot.max_turn_rate * np.linspace(-1, 1, 3)
     axes = (np.linspace(d_min, reach, distances), np.linspace(0, np.pi, bearings),
             np.linspace(-0.4, 0.4, 3), robot.max_speed * np.array([0.0, 0.5, 1.0]),
@@ -160,7 +182,10 @@ def margin_map(
     states = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 5)
     parts = np.array_split(states, max(1, len(states) // falsification.CHUNK))
     least = np.concatenate(
-        [falsification.grid_margins(part, d_min, zeta, eta).min(1) for part in parts]
+        [
+            falsification.grid_margins(part, d_min, zeta, certificate.eta, *held).min(1)
+            for part in parts
+        ]
     )
     overlap = falsification.overlaps_obstacle(envs, states)
     envs.close()
@@ -186,6 +211,12 @@ def trained_policy(certificate: EnergyCertificate) -> Recorded | None:
     """The record of the policy that was trained with it, where there is one (it is optional)."""
     record = certificate.record
     return record if record is not None and record.has_policy else None
+
+
+def _inputs(certificate: EnergyCertificate) -> dict[str, Any]:
+    """What the measurements of a certificate depend on where its decisions are not the default."""
+    entry = decisions_of(certificate).entry()
+    return {"interface": entry} if entry else {}
 
 
 def _label(certificate: EnergyCertificate, task: Task) -> str:

@@ -37,8 +37,9 @@ def episodes(
     seeds: list[int],
     steps: int = 1000,
 ) -> Arrays:
-    """The first `steps` steps of the deterministic policy, one episode a seed.
+    """The first `steps` control steps of the deterministic policy, one episode a seed.
 
+    It is asked for an action where it decides, every ``action_repeat`` steps if it says so.
     Returns robot [T+1, N, 3] (x, y, heading), goal [T+1, N, 2], box [T+1, N, 3] (nan without a
     box), vase [T+1, N, 3] in a task that has one, obstacles [N, M, 2], reward [T, N],
     cost_indicator [T, N], goal_met [T, N], and the task's geometry. The same seeds give the same
@@ -50,6 +51,7 @@ def episodes(
             f"{name_of(task)} episodes have {envs.max_episode_steps} steps, {steps} were asked"
         )
     observations, _ = envs.reset(seed=seeds)
+    action_repeat = getattr(policy, "action_repeat", 1)
     bodies = ("robot", "goal", "box", *(("vase",) if envs.task.has_vase else ()))
     tracks: dict[str, list[NDArray[Any]]] = {name: [] for name in bodies}
     scores: dict[str, list[NDArray[Any]]] = {
@@ -63,7 +65,9 @@ def episodes(
         for name, track in tracks.items():
             track.append(np.array([_pose(getattr(scene, name)) for scene in scenes], np.float32))
         if step < steps:
-            observations, reward, _, _, infos = envs.step(policy.act(observations))
+            if step % action_repeat == 0:
+                actions = policy.act(observations)
+            observations, reward, _, _, infos = envs.step(actions)
             scores["reward"].append(reward.astype(np.float32))
             for name in ("cost_indicator", "goal_met"):
                 scores[name].append(infos[name].astype(np.float32))
