@@ -13,6 +13,7 @@ that does so gives the least volume. `frontier` therefore searches k and n only.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -302,8 +303,12 @@ def fly(policy: Acts, starts: Floats, dynamics: AircraftDynamics) -> Flights:
     running = np.ones(len(starts), bool)
     collided, effort = np.zeros(len(starts), bool), np.zeros(len(starts))
     steps, least = np.zeros(len(starts), np.int64), infos["d"][:, 0].copy()
-    while running.any():
-        actions = policy.act(observations, deterministic=True)
+    action_repeat = getattr(policy, "action_repeat", 1)
+    for step in itertools.count():
+        if not running.any():
+            break
+        if step % action_repeat == 0:
+            actions = policy.act(observations, deterministic=True)
         observations, rewards, terminated, truncated, infos = envs.step(actions)
         d = infos["d"][:, 0].copy()
         if "final_info" in infos:
