@@ -145,6 +145,11 @@ def interface_of(envs: Any) -> Interface:
     return getattr(envs, "interface", Interface())
 
 
+def control_steps(infos: Mapping[str, Any], num_envs: int) -> int:
+    """Control steps of all worlds in a step, or decision, with these infos."""
+    return int(np.broadcast_to(info_of(infos, "control_steps"), num_envs).sum())
+
+
 def held(envs: SafetyEnvs, action_repeat: int) -> SafetyEnvs:
     """Environments whose actions, their own, are held: what a trained policy is flown in."""
     return Interface(action_repeat).around(envs)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
 from safemr.learning.episode_statistics import EpisodeStatistics
-from safemr.learning.interface import interface_of
+from safemr.learning.interface import control_steps, interface_of
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
 from safemr.learning.replay import Replay
@@ -140,7 +140,7 @@ class Trainer:
         self.replay.add(actions=action, **tensors)
         self._episodes.update(rewards, terminated, truncated, infos)
         self._observations, self._features = observations, features
-        self.step += _control_steps(infos, config.num_envs)
+        self.step += control_steps(infos, config.num_envs)
 
     def _explore(self, actions: Tensor) -> Tensor:
         """The policy's actions [N, A], or random ones that are held for several decisions.
@@ -205,9 +205,3 @@ class Trainer:
         self._observations = np.array(state["observations"], np.float32)
         self._features = np.array(state["features"], np.float32)
         self.envs.set_state(state["envs"])
-
-
-def _control_steps(infos: Mapping[str, Any], num_envs: int) -> int:
-    """Control steps that a batched step of the environments had."""
-    steps = infos.get("control_steps")
-    return num_envs if steps is None else int(np.sum(steps))

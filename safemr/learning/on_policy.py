@@ -20,7 +20,7 @@ from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, g
 from safemr.learning.episode_statistics import EpisodeStatistics
 from safemr.learning.gaussian import GaussianActor, entropy, kl_divergence, log_density
 from safemr.learning.hyperparameters import Hyperparameters, Setting
-from safemr.learning.interface import interface_of
+from safemr.learning.interface import control_steps, interface_of
 from safemr.learning.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
@@ -230,7 +230,7 @@ class OnPolicyTrainer(ABC):
                     actions.numpy()
                 )
                 self.statistics.update(rewards, terminated, truncated, infos)
-                steps += int(np.sum(infos.get("control_steps", config.num_envs)))
+                steps += control_steps(infos, config.num_envs)
                 finals = None
                 if truncated.any():
                     finals = torch.from_numpy(self.transform(infos["final_obs"]))
