@@ -10,6 +10,7 @@ stored successor everywhere else, the cut at the end of the rollout included.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -107,6 +108,39 @@ class Rollout:
         for row, (t, i, _) in enumerate(self._finals, start=(steps + 1) * num_envs):
             following[:, t, i] = outputs[:, row]
         return stored[:, :-1], following
+
+
+@dataclass(frozen=True)
+class Batch:
+    """An epoch's B samples, or some of them, and the policy that took them."""
+
+    observations: Tensor  # [B, D], transformed
+    actions: Tensor  # [B, A], before the environment's clipping
+    mean: Tensor  # [B, A] of the old policy
+    log_std: Tensor  # [A] of the old policy
+    log_density: Tensor  # [B] of the actions under the old policy
+    advantages: Tensor  # [B], standardised
+    cost_advantages: Tensor  # [B], centred
+    returns: Tensor  # [2, B], discounted reward and cost to go
+    episode_cost: float  # EpCost, see `on_policy.OnPolicyTrainer.episode_cost`
+    episode_decisions: float  # its length in decisions
+
+    def select(self, indices: Tensor | slice) -> Batch:
+        """The samples of a minibatch."""
+        if isinstance(indices, slice):
+            return self
+        return Batch(
+            self.observations[indices],
+            self.actions[indices],
+            self.mean[indices],
+            self.log_std,
+            self.log_density[indices],
+            self.advantages[indices],
+            self.cost_advantages[indices],
+            self.returns[:, indices],
+            self.episode_cost,
+            self.episode_decisions,
+        )
 
 
 def minibatches(size: int, batch: int, generator: torch.Generator) -> Iterator[Tensor | slice]:
