@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import io
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from safemr.errors import UserError
 from safemr.experiment.config import load
 from safemr.experiment.planning import resolve
 from safemr.learning.evaluation import evaluate
+from safemr.learning.hyperparameters import resolved
 from safemr.learning.on_policy import Batch, explained_variance
 from safemr.learning.policies import Policy
 from safemr.learning.rollouts import Rollout, gae, minibatches
@@ -299,7 +299,7 @@ def test_published_settings_are_valid(name):
     assert module.Config() != config
     runs = resolve(load(["config/config.yaml", "config/published.yaml"])).runs
     (run,) = (run for run in runs if run.config["algorithm"]["name"] == name)
-    assert run.config["algorithm"]["hyperparameters"] == asdict(config)
+    assert run.config["algorithm"]["hyperparameters"] == resolved(config)
 
 
 @pytest.mark.parametrize(
