@@ -200,11 +200,12 @@ class OnPolicyTrainer(ABC):
         """The trust region's derivatives at the actor as it is."""
         return self.fused.region(batch) if self.fused else TorchRegion(self.actor, batch)
 
-    def _act(self, observations: Tensor, perturbation: Tensor) -> Tensor:
+    def _act(self, observations: np.ndarray, perturbation: np.ndarray) -> np.ndarray:
         """Mean actions plus a perturbation, [N, A], for transformed observations [N, D]."""
         if self.fused:
             return self.fused.act(observations, perturbation)
-        return self.actor.mean(observations) + perturbation
+        mean = self.actor.mean(torch.from_numpy(observations))
+        return (mean + torch.from_numpy(perturbation)).numpy()
 
     def _collect(self) -> tuple[Batch, dict[str, float]]:
         """One rollout with the current policy, and its advantages."""
@@ -214,19 +215,17 @@ class OnPolicyTrainer(ABC):
         std = self.actor.log_std.detach().exp()
         noise = std * torch.randn(rollout.actions.shape, generator=self.noise)
         with torch.no_grad():
-            for perturbation in noise:
-                inputs = torch.from_numpy(self.transform(self.observations))
+            for perturbation in noise.numpy():
+                inputs = self.transform(self.observations)
                 actions = self._act(inputs, perturbation)
-                self.observations, rewards, terminated, truncated, infos = self.envs.step(
-                    actions.numpy()
-                )
+                self.observations, rewards, terminated, truncated, infos = self.envs.step(actions)
                 self.statistics.update(rewards, terminated, truncated, infos)
                 steps += int(np.sum(infos.get("control_steps", config.num_envs)))
                 finals = None
                 if truncated.any():
-                    finals = torch.from_numpy(self.transform(infos["final_obs"]))
+                    finals = self.transform(infos["final_obs"])
                 rollout.add(inputs, actions, rewards, infos["cost"], terminated, truncated, finals)
-            rollout.close(torch.from_numpy(self.transform(self.observations)))
+            rollout.close(self.transform(self.observations))
         self.step += steps
         return self._batch(episodes_before, steps)
 

@@ -43,10 +43,10 @@ class FusedSteps:
         self._actor, self._critics = network(actor.network), network(critics)
         self._log_std: Floats = actor.log_std.detach().numpy()
 
-    def act(self, observations: Tensor, perturbation: Tensor) -> Tensor:
+    def act(self, observations: Floats, perturbation: Floats) -> Floats:
         """Mean actions plus a perturbation, [N, A], for transformed observations [N, D]."""
-        inputs = np.ascontiguousarray(observations.numpy())
-        return torch.from_numpy(kernels.act(self._actor, inputs, perturbation.numpy()))
+        actions: Floats = kernels.act(self._actor, np.ascontiguousarray(observations), perturbation)
+        return actions
 
     def mean(self, observations: Tensor) -> Tensor:
         """The actor's mean actions [B, A]."""

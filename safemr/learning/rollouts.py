@@ -47,7 +47,9 @@ class Rollout:
         self.signals = np.zeros((2, steps, num_envs))
         self.terminated = np.zeros((steps, num_envs), dtype=bool)
         self.truncated = np.zeros((steps, num_envs), dtype=bool)
-        self._finals: list[tuple[int, int, Tensor]] = []
+        # the same memory: NumPy stores a few numbers six times faster than PyTorch
+        self._observations, self._actions = self.observations.numpy(), self.actions.numpy()
+        self._finals: list[tuple[int, int, np.ndarray]] = []
         self.length = 0
 
     def clear(self) -> None:
@@ -57,13 +59,13 @@ class Rollout:
 
     def add(
         self,
-        observations: Tensor,
-        actions: Tensor,
+        observations: np.ndarray,
+        actions: np.ndarray,
         rewards: np.ndarray,
         costs: np.ndarray,
         terminated: np.ndarray,
         truncated: np.ndarray,
-        final_observations: Tensor | None,
+        final_observations: np.ndarray | None,
     ) -> None:
         """One step of all N environments.
 
@@ -71,8 +73,8 @@ class Rollout:
         ``terminated | truncated`` [N] holds somewhere, and read only there.
         """
         t = self.length
-        self.observations[t] = observations
-        self.actions[t] = actions
+        self._observations[t] = observations
+        self._actions[t] = actions
         self.signals[0, t] = rewards
         self.signals[1, t] = costs
         self.terminated[t] = terminated
@@ -80,11 +82,11 @@ class Rollout:
         self.length += 1
         if final_observations is not None:
             for i in np.flatnonzero(truncated & ~terminated):
-                self._finals.append((t, int(i), final_observations[i].clone()))
+                self._finals.append((t, int(i), np.array(final_observations[i])))
 
-    def close(self, observations: Tensor) -> None:
+    def close(self, observations: np.ndarray) -> None:
         """Stores the observations [N, D] that follow the last step."""
-        self.observations[self.length] = observations
+        self._observations[self.length] = observations
 
     @property
     def ended(self) -> np.ndarray:
@@ -99,7 +101,8 @@ class Rollout:
         steps, num_envs = self.terminated.shape
         rows = [self.observations.flatten(0, 1)]
         if self._finals:
-            rows.append(torch.stack([observation for _, _, observation in self._finals]))
+            finals = np.stack([observation for _, _, observation in self._finals])
+            rows.append(torch.from_numpy(finals))
         with torch.no_grad():
             outputs = critics(torch.cat(rows)).squeeze(-1).double().numpy()
         stored = outputs[:, : (steps + 1) * num_envs].reshape(2, steps + 1, num_envs)
