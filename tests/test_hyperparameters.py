@@ -143,7 +143,7 @@ ADDED = {
         "explore_hold_max": 15,
         "explore_until": 0.8,
     },
-    "on_policy": {},
+    "on_policy": {"backend": "torch"},
 }
 
 
@@ -156,7 +156,10 @@ def test_what_came_later_is_resolved_only_where_it_is_set(name: str) -> None:
     assert plain == {k: v for k, v in dataclasses.asdict(config).items() if k not in added}
     assert catalogue.hyperparameters(algorithm, added, "test") == plain
     for field, default in added.items():
-        other = default / 2 if isinstance(default, float) and default else default + 1
+        if isinstance(default, str):
+            other = {"backend": "fused"}[field]
+        else:
+            other = default / 2 if isinstance(default, float) and default else default + 1
         changed = catalogue.hyperparameters(algorithm, {field: other}, "test")
         assert changed == {**plain, field: other}
 

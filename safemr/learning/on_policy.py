@@ -10,7 +10,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -18,13 +18,17 @@ from torch import Tensor
 
 from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
 from safemr.learning.episode_statistics import EpisodeStatistics
-from safemr.learning.gaussian import GaussianActor, entropy, kl_divergence, log_density
+from safemr.learning.gaussian import GaussianActor, entropy, log_density, ratio_and_kl
 from safemr.learning.hyperparameters import Hyperparameters, Setting
 from safemr.learning.interface import control_steps, interface_of
 from safemr.learning.networks import ACTIVATIONS, Activation, StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
-from safemr.learning.rollouts import Rollout, gae, minibatches
+from safemr.learning.rollouts import Batch, Rollout, gae, minibatches
+from safemr.learning.trust_region import Region, TorchRegion
+
+if TYPE_CHECKING:
+    from safemr.learning.on_policy_steps import FusedSteps
 
 # Settings of the published experiments (safety-starter-agents) that differ from the defaults here;
 # the algorithms add their own. Networks and epoch are those of the JointSIS authors' comparison.
@@ -62,6 +66,7 @@ class OnPolicyConfig(Hyperparameters):
     value_lr: float = 1e-3  # learning rate of both critics
     value_passes: int = 8  # over the epoch's data, for both critics
     value_batch: int = 500  # samples a critic step; at most the whole epoch
+    backend: Literal["torch", "fused"] = "torch"  # PyTorch, or numba's kernels, which are faster
 
     RANGES: ClassVar[Mapping[str, str]] = {
         "cost_limit": "[0, inf)",
@@ -75,7 +80,11 @@ class OnPolicyConfig(Hyperparameters):
         "value_lr": "(0, 1]",  # Adam moves every parameter by about its rate a step
         **dict.fromkeys(("value_passes", "value_batch"), "[1, inf)"),
     }
-    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {"activation": ACTIVATIONS}
+    ADDED: ClassVar[frozenset[str]] = frozenset({"backend"})
+    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "activation": ACTIVATIONS,
+        "backend": ("torch", "fused"),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,46 +106,6 @@ class OnPolicyConfig(Hyperparameters):
             self.epoch_steps % stride == 0,
             f"must be a multiple of num_envs x action_repeat = {stride}",
         )
-
-
-@dataclass(frozen=True)
-class Batch:
-    """An epoch's B samples, or some of them, and the policy that took them."""
-
-    observations: Tensor  # [B, D], transformed
-    actions: Tensor  # [B, A], before the environment's clipping
-    mean: Tensor  # [B, A] of the old policy
-    log_std: Tensor  # [A] of the old policy
-    log_density: Tensor  # [B] of the actions under the old policy
-    advantages: Tensor  # [B], standardised
-    cost_advantages: Tensor  # [B], centred
-    returns: Tensor  # [2, B], discounted reward and cost to go
-    episode_cost: float  # EpCost, see `OnPolicyTrainer.episode_cost`
-    episode_decisions: float  # its length in decisions
-
-    def select(self, indices: Tensor | slice) -> Batch:
-        """The samples of a minibatch."""
-        if isinstance(indices, slice):
-            return self
-        return Batch(
-            self.observations[indices],
-            self.actions[indices],
-            self.mean[indices],
-            self.log_std,
-            self.log_density[indices],
-            self.advantages[indices],
-            self.cost_advantages[indices],
-            self.returns[:, indices],
-            self.episode_cost,
-            self.episode_decisions,
-        )
-
-
-def ratio_and_kl(actor: GaussianActor, batch: Batch) -> tuple[Tensor, Tensor]:
-    """pi(a|s) / pi_old(a|s), [B], and E_s[KL(pi_old || pi)], both differentiable."""
-    mean = actor.mean(batch.observations)
-    ratio = torch.exp(log_density(batch.actions, mean, actor.log_std) - batch.log_density)
-    return ratio, kl_divergence(batch.mean, batch.log_std, mean, actor.log_std).mean()
 
 
 def explained_variance(predictions: np.ndarray, targets: np.ndarray) -> float:
@@ -169,6 +138,7 @@ class OnPolicyTrainer(ABC):
         self.critic_optimizer = torch.optim.Adam(
             [self.critics.parameters], lr=config.value_lr, fused=True
         )
+        self.fused = self._fused() if config.backend == "fused" else None
         self.noise, self.order = generator(seed, 1), generator(seed, 2)
         self.rollout = Rollout(
             config.epoch_steps // (config.num_envs * self.interface.action_repeat),
@@ -178,6 +148,11 @@ class OnPolicyTrainer(ABC):
         )
         self.statistics = EpisodeStatistics(config.num_envs)
         self.observations, _ = self.envs.reset(seed=environment_seed(seed, 3))
+
+    def _fused(self) -> FusedSteps:
+        from safemr.learning.on_policy_steps import FusedSteps  # compiled when it is asked for
+
+        return FusedSteps(self.actor, self.critics)
 
     @property
     def policy(self) -> Policy:
@@ -210,10 +185,27 @@ class OnPolicyTrainer(ABC):
     def _epoch(self) -> dict[str, float]:
         batch, metrics = self._collect()
         metrics |= self.update_policy(batch)
-        with torch.no_grad():
-            metrics["kl"] = float(ratio_and_kl(self.actor, batch)[1])
+        metrics["kl"] = self._divergence(batch)
         metrics["entropy"] = entropy(self.actor.log_std)
         return metrics | self._fit_critics(batch)
+
+    @torch.no_grad()
+    def _divergence(self, batch: Batch) -> float:
+        """E_s[KL(pi_old || pi)]."""
+        if self.fused:
+            return self.fused.surrogates(batch)[2]
+        return float(ratio_and_kl(self.actor, batch)[1])
+
+    def region(self, batch: Batch) -> Region:
+        """The trust region's derivatives at the actor as it is."""
+        return self.fused.region(batch) if self.fused else TorchRegion(self.actor, batch)
+
+    def _act(self, observations: np.ndarray, perturbation: np.ndarray) -> np.ndarray:
+        """Mean actions plus a perturbation, [N, A], for transformed observations [N, D]."""
+        if self.fused:
+            return self.fused.act(observations, perturbation)
+        mean = self.actor.mean(torch.from_numpy(observations))
+        return (mean + torch.from_numpy(perturbation)).numpy()
 
     def _collect(self) -> tuple[Batch, dict[str, float]]:
         """One rollout with the current policy, and its advantages."""
@@ -223,25 +215,23 @@ class OnPolicyTrainer(ABC):
         std = self.actor.log_std.detach().exp()
         noise = std * torch.randn(rollout.actions.shape, generator=self.noise)
         with torch.no_grad():
-            for perturbation in noise:
-                inputs = torch.from_numpy(self.transform(self.observations))
-                actions = self.actor.mean(inputs) + perturbation
-                self.observations, rewards, terminated, truncated, infos = self.envs.step(
-                    actions.numpy()
-                )
+            for perturbation in noise.numpy():
+                inputs = self.transform(self.observations)
+                actions = self._act(inputs, perturbation)
+                self.observations, rewards, terminated, truncated, infos = self.envs.step(actions)
                 self.statistics.update(rewards, terminated, truncated, infos)
                 steps += control_steps(infos, config.num_envs)
                 finals = None
                 if truncated.any():
-                    finals = torch.from_numpy(self.transform(infos["final_obs"]))
+                    finals = self.transform(infos["final_obs"])
                 rollout.add(inputs, actions, rewards, infos["cost"], terminated, truncated, finals)
-            rollout.close(torch.from_numpy(self.transform(self.observations)))
+            rollout.close(self.transform(self.observations))
         self.step += steps
         return self._batch(episodes_before, steps)
 
     def _batch(self, episodes_before: int, steps: int) -> tuple[Batch, dict[str, float]]:
         config, rollout = self.config, self.rollout
-        values, following = rollout.values(self.critics)
+        values, following = rollout.values(self.fused.values if self.fused else self.critics)
         advantages, returns = np.empty_like(values), np.empty_like(values)
         settings = (
             (config.gamma, config.gae_lambda),
@@ -259,7 +249,7 @@ class OnPolicyTrainer(ABC):
         observations = rollout.observations[:-1].flatten(0, 1)
         actions = rollout.actions.flatten(0, 1)
         with torch.no_grad():
-            mean = self.actor.mean(observations)
+            mean = (self.fused or self.actor).mean(observations)
             log_std = self.actor.log_std.detach().clone()
             densities = log_density(actions, mean, log_std)
         episode_cost, episode_length = self.episode_cost(episodes_before, steps)
@@ -301,16 +291,20 @@ class OnPolicyTrainer(ABC):
         config, losses = self.config, []
         for _ in range(config.value_passes):
             for indices in minibatches(len(batch.actions), config.value_batch, self.order):
-                values = self.critics(batch.observations[indices]).squeeze(-1)
-                errors = values - batch.returns[:, indices]
-                loss = errors.square().mean(1)
-                (self.critics.parameters.grad,) = torch.autograd.grad(
-                    loss.sum(), self.critics.parameters
-                )
-                self.critic_optimizer.step()
-                losses.append(loss.detach())
+                losses.append(self._value_step(batch, indices))
         reward_loss, cost_loss = torch.stack(losses).mean(0).tolist()
         return {"value_loss": reward_loss, "cost_value_loss": cost_loss}
+
+    def _value_step(self, batch: Batch, indices: Tensor | slice) -> Tensor:
+        """One step on a minibatch; the losses of both critics before it, [2]."""
+        if self.fused:
+            return self.fused.value_step(batch, indices, self.critic_optimizer)
+        values = self.critics(batch.observations[indices]).squeeze(-1)
+        errors = values - batch.returns[:, indices]
+        loss = errors.square().mean(1)
+        (self.critics.parameters.grad,) = torch.autograd.grad(loss.sum(), self.critics.parameters)
+        self.critic_optimizer.step()
+        return loss.detach()
 
     def state_dict(self) -> dict[str, Any]:
         return {
