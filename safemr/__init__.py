@@ -7,7 +7,7 @@ evaluate_record  a recorded policy on layouts of its task
 make_envs        a batched environment of a task
 SafetyFilter     a wrapper of Gymnasium that keeps actions within a certificate
 filter_actions   the same without an environment
-EnergyCertificate  the paper's family of certificates, from sigma, k and n
+EnergyCertificate, Zeta  the paper's family of certificates, and its sigma, k and n
 UserError        what all of them raise where the user can fix it
 
 Each is imported when it is first asked for: `import safemr` itself costs nothing. Within the
@@ -28,12 +28,14 @@ if TYPE_CHECKING:
     from safemr.filters.wrapper import SafetyFilter
     from safemr.learning.policies import load_policy
     from safemr.measure.evaluate import evaluate_record
+    from safemr.paper import Zeta
     from safemr.tasks import make_envs
 
 __all__ = [
     "EnergyCertificate",
     "SafetyFilter",
     "UserError",
+    "Zeta",
     "evaluate_record",
     "filter_actions",
     "load",
@@ -46,6 +48,7 @@ _HOMES = {
     "EnergyCertificate": "safemr.certificates.certificate",
     "SafetyFilter": "safemr.filters.wrapper",
     "UserError": "safemr.errors",
+    "Zeta": "safemr.paper",
     "evaluate_record": "safemr.measure.evaluate",
     "filter_actions": "safemr.filters.filter",
     "load": "safemr.experiment.loaded",

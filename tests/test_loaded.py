@@ -58,7 +58,7 @@ def test_what_is_not_there_is_told() -> None:
     loaded = safemr.load(str(BASELINE))
     with pytest.raises(UserError, match="no energy function"):
         loaded.certificate  # noqa: B018
-    with pytest.raises(UserError, match="no folder"):
+    with pytest.raises(UserError, match="json is missing; repair"):
         safemr.load(RUNS / "SafeMR/seed9-000000000000")
     with pytest.raises(UserError, match="d has shape"):
         safemr.load(OURS).certificate.phi(np.ones(3), np.ones(2))

@@ -146,7 +146,7 @@ def _crossed(grid: Array, target: Array) -> Array:
     if grid.shape[2] > 1:
         for component in range(grid.shape[2]):
             values = np.sort(grid[:, :, component], 1)
-            kept = (np.diff(values, axis=1) > 0).any(0).nonzero()[0]  # the same for all rows
+            kept = np.flatnonzero((np.diff(values, axis=1) > 0).any(axis=0))  # the same for all
             values = values[:, [0, *(kept + 1)]]
             crossed = np.repeat(target[:, None], values.shape[1], 1)
             crossed[:, :, component] = values

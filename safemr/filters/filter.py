@@ -120,7 +120,8 @@ def unbound(certificate: Any, d_min: float | None) -> tuple[Certificate, float |
     if not isinstance(certificate, Certificate):
         raise UserError(
             f"{show(certificate)} is no certificate: give that of a record, "
-            "safemr.load(folder).certificate, or safemr.EnergyCertificate(name, (sigma, k, n))"
+            "safemr.load(folder).certificate, or "
+            "safemr.EnergyCertificate(name, safemr.Zeta(sigma, k, n))"
         )
     number = isinstance(least, int | float | np.number) and not isinstance(least, bool)
     if least is not None and not (number and 0.0 < least < np.inf):

@@ -46,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     record = load(options.record)
     envs = record.make_envs(1)
     d_min, drawn = float(envs.d_min), hasattr(envs, "scene")
+    rate = float(envs.metadata.get("render_fps", 50))  # steps a second
     envs.close()
     if options.certificate in HANDCRAFTED:
         certificate = BoundCertificate(handcrafted(options.certificate), d_min)
@@ -66,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     film(
         data, certificate, options.video,
         title=title, acts=options.filter, draw_scene=draw_scene, stride=options.stride,
+        step_s=1 / rate,
     )  # fmt: skip
     print(
         f"{options.video}: {title}, layout {seed}, {len(data['phi'])} steps: return "

@@ -22,8 +22,8 @@ DPI = 100
 WIDTH, HEIGHT = 7.2, 3.3  # inches
 TRAIL = 75  # steps of the path that are shown
 WINDOW = 200  # steps around the present one that the right side shows
-INTERVENED, VIOLATING = "#D55E00", "#B2182B"
-WRITERS = {".gif": animation.PillowWriter, ".mp4": animation.FFMpegWriter}
+INTERVENED, VIOLATING, COURSE = "#D55E00", "#B2182B", "#009E73"
+WRITERS: dict[str, Any] = {".gif": animation.PillowWriter, ".mp4": animation.FFMpegWriter}
 
 
 def check_video(path: Path) -> None:
@@ -69,8 +69,9 @@ def film(
             move(step)
             for cursor in cursors:
                 cursor.set_xdata([step, step])
-            first = min(max(0, step - WINDOW // 2), max(0, len(data["phi"]) - WINDOW))
-            size.set_xlim(first, first + WINDOW)
+            shown = min(WINDOW, len(data["phi"]))
+            first = min(max(0, step - shown // 2), len(data["phi"]) - shown)
+            size.set_xlim(first, first + shown)
             writer.grab_frame()
 
 
@@ -101,8 +102,8 @@ def _plane(data: Arrays, ax: Axes, certificate: BoundCertificate) -> Callable[[i
         ax.plot(data["d"], data["d_dot"], color="0.85", lw=0.5)
     else:
         certificate.plot(ax, speed=max(1e-3, float(np.abs(data["d_dot"]).max())))
-    (trail,) = ax.plot([], [], color="k", lw=1)
-    (point,) = ax.plot([], [], ls="none", marker="o", color="k", ms=4)
+    (trail,) = ax.plot([], [], color=COURSE, lw=1.2)
+    (point,) = ax.plot([], [], ls="none", marker="o", color=COURSE, ms=4)
 
     def move(step: int) -> None:
         part = slice(max(0, step - TRAIL), step + 1)
