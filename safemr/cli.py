@@ -3,6 +3,7 @@
 safemr train ...      train one run
 safemr evaluate ...   evaluate a recorded policy
 safemr certify ...    check a learned energy function
+safemr play RECORD .. draw an episode of a policy, with phi and the filter's interventions
 safemr records ...    verify the records under a results root and say what is unfinished
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
@@ -26,6 +27,7 @@ COMMANDS = {
     "train": "safemr.experiment.train",
     "evaluate": "safemr.measure.evaluate",
     "certify": "safemr.report.certificates",
+    "play": "safemr.report.play",
     "records": "safemr.experiment.overview",
     "list": "safemr.experiment.listing",
     "config": "safemr.experiment.config",

@@ -57,6 +57,12 @@ VALID: dict[str, Any] = {
     "figures_root": "paper_figures",
     "wandb": {"mode": "disabled", "project": "safemr"},
     "safe": {"cost_tolerance": 1.0, "zero_violation_share": 0.95},
+    "filters": {
+        "policies": ["PPO-L"],
+        "certificates": ["phi_h", "SafeMR"],
+        "episodes": 3,
+        "seed": 40000,
+    },
 }
 
 NOT_A_NUMBER = ["1", "1e5", None, [], {}, True, datetime.date(2020, 1, 1)]
@@ -171,6 +177,13 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
     ("unseen_layouts",): [*NOT_A_MAPPING, {"seed": 1}, {"episode": 5}],
     ("unseen_layouts", "episodes"): NOT_POSITIVE,
     ("unseen_layouts", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("filters",): [*NOT_A_MAPPING, {"policies": ["PPO-L"]}, {"policy": ["PPO-L"]}],
+    ("filters", "policies"): [*NOT_A_LIST, ["PPO"], ["PPO-L", "PPO-L"]],
+    ("filters", "certificates"): [*NOT_A_LIST, ["phi_1"], ["phi_h", "phi_h"]],
+    ("filters", "episodes"): NOT_POSITIVE,
+    ("filters", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("filters", "tasks"): [*NOT_A_LIST, ["Pillars-0.30-Goal"]],
+    ("filters", "seeds"): [*NOT_A_LIST, [0], [100, 100]],
     ("task_overrides",): [
         *NOT_A_MAPPING,
         *({name: {}} for name in ["Pillar-0.15-Goal", *NOT_A_NAME[2:]]),
@@ -463,6 +476,7 @@ CHANGES: list[tuple[tuple[str, ...], Any, int]] = [
     (("task_overrides", "Hazards-0.15-Push", "interface"), {"action_repeat": 2}, 4 + 2),
     (("interface",), {"action_repeat": 1}, 0),
     (("unseen_layouts", "episodes"), 50, 0),
+    (("filters", "episodes"), 50, 0),
     (("wandb", "mode"), "offline", 0),
     (("safe", "cost_tolerance"), 2.0, 0),
     (("figures_root",), "elsewhere", 0),

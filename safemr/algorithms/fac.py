@@ -37,6 +37,7 @@ from torch import Tensor
 from safemr.certificates import energy
 from safemr.learning import off_policy
 from safemr.learning.losses import REWARD_CRITICS
+from safemr.learning.policies import network_arrays
 from safemr.learning.replay import Batch
 from safemr.learning.soft_actor_critic import SoftActorCritic, SoftActorCriticConfig
 
@@ -68,6 +69,7 @@ class Config(SoftActorCriticConfig):
     constraint_floor: float = -0.001
     constraint_scale: float = 10.0  # Q_phi learns scale * g, so that its errors count beside Q_w's
     multiplier_bias: float = -3.0  # start of the last layer's bias
+    record_critic: bool = False  # keep Q_phi in the policy file, as a model of the safety filter
 
     RANGES: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(("sigma", "n", "eta"), "[0, 10]"),
@@ -75,6 +77,7 @@ class Config(SoftActorCriticConfig):
         "length_scale": "[0.001, 1000]",
         "constraint_floor": "[-inf, 0]",
     }
+    ADDED: ClassVar[frozenset[str]] = frozenset({"record_critic"})
 
 
 def constraint_values(batch: Batch, zeta: Tensor, d_min: float, config: Config) -> Tensor:
@@ -121,9 +124,14 @@ class Agent(SoftActorCritic):
         return {"sigma": sigma, "k": k, "n": n, **super().metrics()}
 
     def extras(self) -> dict[str, Any]:
-        """zeta and its unit beside the base's."""
+        """zeta and its unit beside the base's, and Q_phi where it is asked for."""
+        critic: dict[str, Any] = {}
+        if self.config.record_critic:
+            critic |= network_arrays("critic", self.critics.member(REWARD_CRITICS))
+            critic["critic_scale"] = np.array(self.config.constraint_scale)
         return {
             **super().extras(),
+            **critic,
             "zeta": self.zeta.detach().cpu().numpy().copy(),
             "length_scale": np.array(self.config.length_scale),
         }

@@ -19,6 +19,7 @@ from typing import Any
 
 from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, evaluation_seed, unseen_seed
 from safemr.errors import UserError, show
+from safemr.experiment.filter_entries import Filters, read_filters
 from safemr.experiment.roles import ROLES
 from safemr.experiment.sections import (
     LARGEST_SEED,
@@ -153,6 +154,7 @@ class Config:
     wandb_project: str
     cost_tolerance: float
     zero_violation_share: float
+    filters: Filters | None
 
 
 def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None) -> Config:
@@ -219,6 +221,7 @@ def parse(raw: Any) -> Config:
         zero_violation_share=number(
             safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
+        filters=read_filters(top.get("filters"), top.required("algorithms"), tasks, seeds),
     )
     if config.log_points % config.evaluation.points:
         raise UserError(
@@ -245,7 +248,7 @@ _TOP_LEVEL = (
         "figures_root",
         "allow_missing",
     ),
-    *("wandb", "safe"),
+    *("wandb", "safe", "filters"),
 )
 
 

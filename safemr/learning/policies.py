@@ -100,6 +100,12 @@ class Policy:
         actions = (mean.tanh() if self.squash else mean.clamp(-1.0, 1.0)).cpu().numpy()
         return self.interface.scaled(actions)
 
+    def __call__(
+        self, observations: NDArray[np.floating], deterministic: bool = True
+    ) -> NDArray[np.float32]:
+        """`act`."""
+        return self.act(observations, deterministic)
+
     def arrays(self) -> Arrays:
         """Everything needed to act again, as arrays for `numpy.savez`."""
         arrays = {
