@@ -31,7 +31,7 @@ import torch
 
 from safemr import files
 from safemr.errors import UserError, tell
-from safemr.experiment import provenance, records
+from safemr.experiment import packages, provenance, records
 from safemr.experiment.locks import ProcessLock
 from safemr.experiment.signals import StopSignals
 
@@ -165,6 +165,10 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         self._earlier = {"wall_s": 0.0, "cpu_s": 0.0}
         self._started = time.monotonic()
         self._due = self._started + minimum_interval
+        algorithm = config["algorithm"]
+        self._outside = (  # as it is before it is imported, whatever is edited meanwhile
+            {"algorithm": packages.provenance(algorithm["name"])} if "package" in algorithm else {}
+        )
         self._costs: list[float] = []  # seconds of each checkpoint written
         self._saved = 0  # the step of the last checkpoint
 
@@ -205,7 +209,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
                 tell(f"warning: starting again from step 0: {error}")
         self._saved = self._step()
         started = {"started": provenance.now(), "step": self._saved}
-        self._note({**started, **provenance.source_revision()})
+        self._note({**started, **provenance.source_revision(), **self._outside})
         self._signals.defer()
         return content["state"] if content else None
 
@@ -252,6 +256,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         attempts = read_attempts(self.work)
         origin = {
             **provenance.collect(),
+            **self._outside,
             **{name: round(value, 3) for name, value in self.elapsed().items()},
             "started": next((e["started"] for e in attempts if "started" in e), None),
             "finished": provenance.now(),

@@ -14,7 +14,7 @@ from typing import Any
 
 from safemr import files
 from safemr import tasks as tasks_of
-from safemr.experiment import planning
+from safemr.experiment import packages, planning
 from safemr.experiment.config import Config
 from safemr.experiment.roles import Variants
 from safemr.files import REPOSITORY
@@ -49,6 +49,11 @@ def _key(config: Config) -> str:
     for package in ("envs", "safemr"):
         for source in sorted((REPOSITORY / package).rglob("*.py")):
             digest.update(source.relative_to(REPOSITORY).as_posix().encode() + source.read_bytes())
+    parts = (config.algorithms, config.aircraft.algorithms if config.aircraft else {})
+    for name in sorted({variant.algorithm for part in parts for variant in part.values()}):
+        module = packages.registered().get(name, name)  # the default is cheap: no package is read
+        if packages.is_outside(module):
+            digest.update(f"{module}:{packages.digest(module)}".encode())
     return digest.hexdigest()
 
 
