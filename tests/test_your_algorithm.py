@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 import yaml
 
-from safemr import cli
+from safemr import cli, packages
 from safemr.errors import UserError
-from safemr.experiment import catalogue, check_algorithm, config, packages, planning, train
+from safemr.experiment import catalogue, check_algorithm, config, planning, train
 from safemr.experiment.plan_cache import plan_for
 from safemr.experiment.record import Record
 

@@ -2,7 +2,7 @@
 hyperparameters.
 
 One here is a file of `safemr.algorithms`, by its name; how one of another package is named,
-`safemr.experiment.packages` says. Both keep to the same contract (`load_algorithm`).
+`safemr.packages` says. Both keep to the same contract (`load_algorithm`).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from safemr import packages
 from safemr.certificates.certificate import FAMILIES as CERTIFICATES
 from safemr.certificates.certificate import Certificate, family_named
 from safemr.environments import register_tasks
 from safemr.errors import UserError, show
-from safemr.experiment import packages
 from safemr.experiment.config import FAMILIES, Variant
 from safemr.experiment.roles import BASELINE, LEARNABLE, NOTHING, OUTSIDE, ROLES, Variants
 from safemr.learning.hyperparameters import resolved, unused
@@ -67,7 +67,7 @@ def full_name(name: str, where: str = "") -> str:
     name = name.removeprefix(f"{packages.ALGORITHMS}.")
     if name in algorithm_names() or packages.is_outside(name):
         return name
-    registered = packages.registered()
+    registered = packages.registered(packages.ALGORITHMS)
     if name in registered:
         return registered[name]
     known = [*algorithm_names(), *registered]

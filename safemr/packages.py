@@ -1,7 +1,7 @@
-"""Algorithms of other packages: how they are named and found, and which sources they are.
+"""Modules of other packages: how they are named and found, and which sources they are.
 
-Such an algorithm is a module of any package that Python can import, by its dotted name,
-``my_package.my_algorithm``, or by a shorter one that the package registers:
+An algorithm, or a family of energy functions, is a module of any package that Python can import, by
+its dotted name, ``my_package.my_algorithm``, or by a shorter one that the package registers:
 
     [project.entry-points."safemr.algorithms"]
     my_algorithm = "my_package.my_algorithm"
@@ -25,11 +25,12 @@ from typing import Any
 
 from safemr.errors import UserError
 
-ALGORITHMS = "safemr.algorithms"  # our package of them, and the group of entry points
+# Groups of entry points; the first is our own package of algorithms, too.
+ALGORITHMS, CERTIFICATES = "safemr.algorithms", "safemr.certificates"
 
 
 @functools.cache
-def registered(group: str = ALGORITHMS) -> dict[str, str]:
+def registered(group: str) -> dict[str, str]:
     """Short name -> dotted name of the module, as the installed packages say."""
     return {entry.name: entry.module for entry in metadata.entry_points(group=group)}
 
