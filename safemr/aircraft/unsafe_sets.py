@@ -26,6 +26,7 @@ from safemr.aircraft.reachability.grid import Floats
 from safemr.aircraft.reachability.solver import CONSTANT, Solution
 from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.certificates.energy import energy, magnitude, scaled
+from safemr.certificates.families import Values
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.learning.evaluation import Acts
@@ -109,8 +110,10 @@ def of_states(dynamics: AircraftDynamics, certificate: Certificate) -> Energy:
 def energy_of(
     dynamics: AircraftDynamics, zeta: Sequence[float], length_scale: float = 1.0
 ) -> Energy:
-    """phi of zeta = [sigma, k, n] with lengths in units of ``length_scale`` [m]."""
-    given = EnergyCertificate("zeta", Zeta(*zeta), length_scale=length_scale)
+    """phi of zeta, [sigma, k, n] where it is of no other family, with lengths in units of
+    ``length_scale`` [m]."""
+    point = zeta if isinstance(zeta, Values) else Zeta(*zeta)
+    given = EnergyCertificate("zeta", point, length_scale=length_scale)
     return of_states(dynamics, given)
 
 

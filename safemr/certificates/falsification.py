@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safemr.certificates.energy import constraint, energy, largest
+from safemr.certificates.energy import constraint, largest
+from safemr.certificates.families import PAPER, Parameters, family_of, named, phi_at
 from safemr.certificates.point_robot import ROBOT
 from safemr.errors import UserError
-from safemr.paper import Zeta
 from safemr.tasks import Task, base_of, make_envs, name_of, settings_of, task_settings, traits
 
 Array = NDArray[np.float64]
@@ -63,15 +63,15 @@ def action_grid(turn_rates: Array, action_scale: Sequence[float] = ()) -> Array:
     return np.clip(grid, -np.array(action_scale), action_scale) if action_scale else grid
 
 
-def energies(states: Array, d_min: float, zeta: Zeta) -> Array:
+def energies(states: Array, d_min: float, zeta: Parameters) -> Array:
     """phi(s) [S] of states [S, 5]."""
-    return energy(states[:, 0], -states[:, 3] * np.cos(states[:, 2]), d_min, *zeta)
+    return phi_at(states[:, 0], -states[:, 3] * np.cos(states[:, 2]), d_min, zeta)
 
 
 def grid_margins(
     states: Array,
     d_min: float,
-    zeta: Zeta,
+    zeta: Parameters,
     eta: float,
     action_repeat: int = 1,
     action_scale: Sequence[float] = (),
@@ -87,7 +87,7 @@ def grid_margins(
         pose, velocity = ROBOT.step(pose, velocity, actions.reshape(-1, 2))
     d = np.hypot(pose[:, 0], pose[:, 1])
     d_dot = (pose[:, 0] * velocity[:, 0] + pose[:, 1] * velocity[:, 1]) / d
-    phi_next = energy(d, d_dot, d_min, *zeta).reshape(len(states), count)
+    phi_next = phi_at(d, d_dot, d_min, zeta).reshape(len(states), count)
     return constraint(energies(states, d_min, zeta)[:, None], phi_next, eta)
 
 
@@ -99,7 +99,7 @@ class Falsification:
     """Result of a search; shares are of the sampled states, uniform in the five coordinates."""
 
     task: Task
-    zeta: Zeta
+    zeta: Parameters
     eta: float
     states: Array  # [S, 5]
     phi: Array  # [S]
@@ -129,8 +129,9 @@ class Falsification:
     def example(self) -> dict[str, Any]:
         """The worst state as plain numbers, enough for `replay`.
 
-        What is not said of the task (base, settings) is that of the registered one; without
-        action_repeat an action lasts one control step, without action_scale the grid is whole.
+        What is not said of the task (base, settings) is that of the registered one; without family
+        it is the paper's; without action_repeat an action lasts one control step, without
+        action_scale the grid is whole.
         """
         state = dict(zip(COLUMNS, map(float, self.worst_state), strict=True))
         name, base = name_of(self.task), base_of(self.task)
@@ -141,14 +142,15 @@ class Falsification:
         held: dict[str, Any] = {}
         held |= {"action_repeat": self.action_repeat} if self.action_repeat != 1 else {}
         held |= {"action_scale": list(self.action_scale)} if self.action_scale else {}
-        return {**task, **self.zeta._asdict(), "eta": self.eta, **held, "state": state,
+        family = {} if family_of(self.zeta) is PAPER else {"family": family_of(self.zeta).name}
+        return {**task, **family, **self.zeta._asdict(), "eta": self.eta, **held, "state": state,
                 "margin": self.worst_margin}  # fmt: skip
 
 
 def falsify(
     envs: Any,
     task: Task,
-    zeta: Zeta,
+    zeta: Parameters,
     *,
     eta: float = 0.0,
     count: int = 2**16,
@@ -206,22 +208,26 @@ def falsify(
     )  # fmt: skip
 
 
-def largest_distance(zeta: Zeta, d_min: float, action_repeat: int = 1) -> float:
+# What makes the unsafe set smaller, of another family than the paper's and of the paper's.
+_SMALLER = ("parameters of a smaller unsafe set", "a smaller sigma or k, or a larger n")
+
+
+def largest_distance(zeta: Parameters, d_min: float, action_repeat: int = 1) -> float:
     """Distance beyond which phi < 0 even at full closing speed, and at least 1.5 d_min, m.
 
-    The zero of phi(d, -v_max), found by bisection of `energy`, which falls with d, and the way that
+    The zero of phi(d, -v_max), found by bisection of phi, which falls with d, and the way that
     is driven in the control steps of a decision after its first: from there too it may end in
     phi > 0.
     """
     low, high = d_min, d_min + 20.0
-    if energy(high, -ROBOT.max_speed, d_min, *zeta) > 0:
+    if phi_at(high, -ROBOT.max_speed, d_min, zeta) > 0:
         raise UserError(
-            f"phi is positive {high:.1f} m from the obstacle for sigma, k, n = {tuple(zeta)}: "
-            "no bounded search covers it; use a smaller sigma or k, or a larger n"
+            f"phi is positive {high:.1f} m from the obstacle for {', '.join(zeta._asdict())} = "
+            f"{tuple(zeta)}: no bounded search covers it; use {_SMALLER[family_of(zeta) is PAPER]}"
         )
     for _ in range(60):
         middle = (low + high) / 2
-        positive = energy(middle, -ROBOT.max_speed, d_min, *zeta) > 0
+        positive = phi_at(middle, -ROBOT.max_speed, d_min, zeta) > 0
         low, high = (middle, high) if positive else (low, middle)
     return max(high, 1.5 * d_min) + (action_repeat - 1) * ROBOT.max_speed * ROBOT.step_s
 
@@ -269,7 +275,7 @@ def worlds_near_obstacle(envs: Any, states: Array) -> dict[str, NDArray[Any]]:
 
 
 def next_energies(
-    envs: Any, worlds: Worlds, actions: Array, zeta: Zeta, action_repeat: int = 1
+    envs: Any, worlds: Worlds, actions: Array, zeta: Parameters, action_repeat: int = 1
 ) -> Array:
     """phi(s') [S], the largest over obstacles, of S worlds after holding actions [S, 2].
 
@@ -292,12 +298,12 @@ def next_energies(
             infos = envs.step(actions[rows])[-1]
         # Present where the limit is reached by the last of these steps, by all worlds at once.
         infos = infos.get("final_info", infos)
-        phi = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        phi = largest(phi_at(infos["d"], infos["d_dot"], envs.d_min, zeta))
         result[begin : begin + size] = phi[: count - begin]
     return result
 
 
-def simulated_grid(envs: Any, worlds: Worlds, turn_rates: Array, phi: Array, zeta: Zeta,
+def simulated_grid(envs: Any, worlds: Worlds, turn_rates: Array, phi: Array, zeta: Parameters,
                    eta: float, action_repeat: int = 1,
                    action_scale: Sequence[float] = ()) -> tuple[Array, Array]:  # fmt: skip
     """Actions [S, A, 2] of the grid and g [S, A] in the simulator, for S worlds with phi(s) [S]."""
@@ -311,7 +317,7 @@ def simulated_grid(envs: Any, worlds: Worlds, turn_rates: Array, phi: Array, zet
 def simulated_margins(
     envs: Any,
     states: Array,
-    zeta: Zeta,
+    zeta: Parameters,
     eta: float,
     action_repeat: int = 1,
     action_scale: Sequence[float] = (),
@@ -335,7 +341,8 @@ def replay(example: Mapping[str, Any]) -> tuple[Array, Array]:
     They are held for as many control steps as the example says.
     """
     held = int(example.get("action_repeat", 1)), tuple(example.get("action_scale", ()))
-    zeta = Zeta(example["sigma"], example["k"], example["n"])
+    family = named(str(example.get("family", PAPER.name)))
+    zeta = family.at([float(example[name]) for name in family.names])
     envs = make_simulator(task_of(example))
     states = np.array([[float(example["state"][name]) for name in COLUMNS]])
     worlds, phi = worlds_near_obstacle(envs, states), energies(states, float(envs.d_min), zeta)

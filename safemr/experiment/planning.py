@@ -124,6 +124,8 @@ def make_run(
     """A run from its parts: `describe_task`, `load_algorithm`, `hyperparameters`, and
     `fitted_interface` where the learner does not meet the environment as it is."""
     described = {"name": algorithm.name, "version": algorithm.version, "hyperparameters": values}
+    if algorithm.package is not None:
+        described["package"] = algorithm.package
     return _run(task, described, variant, seed, steps, log_every, evaluation, interface)
 
 

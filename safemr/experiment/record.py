@@ -99,11 +99,13 @@ class Record:
         """The class of its certificate, which its algorithm's file declares.
 
         An outside implementation's record, whose algorithm has no file here, is of the paper's
-        family where it logs sigma, k and n. Raises UserError where there is no certificate.
+        family where it logs sigma, k and n. Raises UserError where there is no certificate, or
+        where the package that has the algorithm is not there.
         """
         from safemr.experiment import catalogue
 
-        if self.algorithm in catalogue.algorithm_names():
+        trained_here = "package" in self.config["algorithm"]  # by a module of another package
+        if trained_here or self.algorithm in catalogue.algorithm_names():
             family = catalogue.declared_certificate(self.algorithm)
         else:
             family = EnergyCertificate.family if self.rows[-1].keys() >= set(Zeta._fields) else None
@@ -112,7 +114,7 @@ class Record:
                 f"{self.folder}: its algorithm, {self.algorithm}, has no energy function and so no "
                 "certificate"
             )
-        return catalogue.certificate_family(family)
+        return catalogue.certificate_family(family, self.algorithm)
 
     def certificate(self) -> Certificate:
         """The certificate that the run ended with. Raises UserError where it has none."""

@@ -16,6 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+from safemr.certificates import families
 from safemr.conventions import evaluation_seed
 from safemr.environments import SafetyEnvs, check_envs
 from safemr.errors import UserError, tell
@@ -25,6 +26,7 @@ from safemr.experiment.sections import checked_name
 from safemr.experiment.signals import StoppedError, StopSignals
 from safemr.experiment.strict_yaml import assignment
 from safemr.learning.interface import Interface
+from safemr.paper import Zeta
 from safemr.tasks import make_envs
 
 if TYPE_CHECKING:
@@ -34,8 +36,11 @@ if TYPE_CHECKING:
 class Progress:
     """What a person sees: a line per log point, redrawn in place on a terminal."""
 
-    def __init__(self, label: str, steps: int, stream: TextIO) -> None:
+    def __init__(
+        self, label: str, steps: int, stream: TextIO, parameters: Sequence[str] = Zeta._fields
+    ) -> None:
         self._label, self._steps, self._stream = label, steps, stream
+        self._parameters = parameters  # of the energy function, shown where they are logged
 
     def show(self, row: Mapping[str, float]) -> None:
         def number(name: str, form: str = ".2f") -> str:
@@ -46,8 +51,8 @@ class Progress:
         rate = row["time_steps_per_s"]
         left = (self._steps - row["step"]) / rate if rate > 0 else 0.0
         zeta = ""
-        if "sigma" in row:
-            zeta = f" | zeta {number('sigma', '.3f')} {number('k', '.3f')} {number('n', '.3f')}"
+        if all(name in row for name in self._parameters):
+            zeta = " | zeta " + " ".join(number(name, ".3f") for name in self._parameters)
         terminal = self._stream.isatty()
         bar = "#" * round(20 * share)
         line = (
@@ -106,7 +111,8 @@ def train(
     if state is not None:
         trainer.load_state_dict(state)
         tell(f"{label} continues at step {trainer.step}", stream)
-    progress = Progress(label, steps, stream)
+    family = families.named(described["hyperparameters"].get("family", families.PAPER.name))
+    progress = Progress(label, steps, stream, family.names)
     with WandbLog(config, session, wandb or {}) as wandb_log:
         while trainer.step < steps:
             begun, before = time.perf_counter(), trainer.step

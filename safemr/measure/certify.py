@@ -5,7 +5,9 @@ Three questions, kept apart: does the analytic condition (*) hold (four verdicts
 (`safemr.certificates.falsification`); and does a trained policy pick violating actions although
 safe ones exist. The certificate is given by its parameters, by a run record, or, with neither, is
 each one that the paper prints. A record's is checked over its own decisions, as long and as large
-as the interface of the run makes them; one without a record over single control steps.
+as the interface of the run makes them; one without a record over single control steps. The analytic
+condition is derived for the paper's phi, and left out for other families (`safemr.certificates.
+families`); all else is theirs, too.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from safemr.experiment.record import Record
 from safemr.learning.interface import Interface
 from safemr.measure.policy_check import check_policy
 from safemr.measure.store import Measurements
+from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
 
 DEFAULT_TASK = paper.SENSITIVITY_TASK  # Table II's
@@ -49,8 +52,8 @@ def paper_certificates() -> list[EnergyCertificate]:
 def certificate_of_record(folder: Path) -> tuple[EnergyCertificate, dict[str, Any]]:
     """The certificate a run ended with, in metres, and its task: the entry in the run's config.
 
-    Raises UserError where there is no record, or one whose certificate is not of the paper's
-    family: the analytic condition and the search are for that one.
+    Raises UserError where there is no record, or one whose certificate is more than a phi of named
+    parameters: the search is for those.
     """
     record = Record.open(folder)
     return EnergyCertificate.from_record(record).in_metres(), record.task
@@ -75,7 +78,8 @@ def certify(
 ) -> tuple[dict[str, Any], falsification.Falsification]:
     """One row of the certificate table, and the search behind it.
 
-    The row: certificate, task, sigma, k, n, eta, the margins of the four analytic verdicts [m/s^2],
+    The row: certificate, task, the parameters by name and, of another family than the paper's,
+    ``family``, eta, the margins of the four analytic verdicts of the paper's family [m/s^2],
     states searched, infeasible and leak share, worst margin, verdicts shared by the simulator, and,
     with a policy, its decisions (``policy_steps``) and their violating and avoidable shares in
     `episodes` episodes, of whose violating decisions at most 8 an episode are searched for a safe
@@ -85,7 +89,10 @@ def certify(
     interface = decisions_of(certificate)
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
-    analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
+    margins: dict[str, float] = {}
+    if isinstance(zeta, Zeta):
+        analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
+        margins = {margin_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()}
     search = falsification.falsify(
         envs, task, zeta, eta=eta, count=states, seed=seed,
         action_repeat=interface.action_repeat, action_scale=interface.action_scale,
@@ -93,11 +100,13 @@ def certify(
     envs.close()
     row: dict[str, Any] = {
         "certificate": certificate.name, "task": name_of(task), **zeta._asdict(), "eta": eta,
-        **{margin_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()},
+        **margins,
         "states": len(search.states), "infeasible_share": search.infeasible_share,
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
         "simulator_agrees": f"{search.confirmed}/{search.examined}",
     }  # fmt: skip
+    if not margins:
+        row["family"] = certificate.energy_family.name
     if interface.action_repeat != 1:
         row["action_repeat"] = interface.action_repeat
     if (record := trained_policy(certificate)) is not None:
@@ -125,7 +134,7 @@ def measured_certificate(
     certificate = certificate.in_metres()
     record = trained_policy(certificate)
     inputs = {
-        "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
+        "name": certificate.name, **certificate.entry, "eta": certificate.eta,
         "task": installed(task),
         "states": states, "episodes": episodes,
         "policy": record and record.inputs,
@@ -146,7 +155,7 @@ def measured_margins(
     """`margin_map` of a certificate, and the task's d_min, kept among ``measurements``."""
     certificate = certificate.in_metres()
     inputs = {
-        "zeta": list(certificate.zeta), "eta": certificate.eta,
+        **certificate.entry, "eta": certificate.eta,
         "task": installed(task),
         **_inputs(certificate),
     }  # fmt: skip

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safemr.certificates.energy import constraint, energy, largest
+from safemr.certificates.energy import constraint, largest
 from safemr.certificates.falsification import make_simulator, simulated_grid
+from safemr.certificates.families import Parameters, phi_at
 from safemr.environments import info_of
 from safemr.learning.evaluation import Acts
 from safemr.learning.interface import Interface
-from safemr.paper import Zeta
 from safemr.tasks import Task
 
 
@@ -44,7 +44,7 @@ class PolicyCheck:
 def check_policy(
     policy: Acts,
     task: Task,
-    zeta: Zeta,
+    zeta: Parameters,
     *,
     eta: float = 0.0,
     num_envs: int = 32,
@@ -68,14 +68,14 @@ def check_policy(
     total = 0
     for _ in range(interface.decisions(steps)):
         before = envs.get_state()["worlds"]
-        phi = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        phi = largest(phi_at(infos["d"], infos["d_dot"], envs.d_min, zeta))
         turn_rates = observations[:, gyro][:, 2]
         observations, _, terminated, truncated, infos = envs.step(policy.act(observations))
         reached = {name: infos[name].copy() for name in ("d", "d_dot")}
         done = terminated | truncated
         for name in reached if done.any() else ():
             reached[name][done] = infos["final_info"][name][done]
-        phi_next = largest(energy(reached["d"], reached["d_dot"], envs.d_min, *zeta))
+        phi_next = largest(phi_at(reached["d"], reached["d_dot"], envs.d_min, zeta))
         whole = np.full(num_envs, info_of(infos, "control_steps") == interface.action_repeat)
         total += int(whole.sum())
         for index in np.flatnonzero(whole & (constraint(phi, phi_next, eta) >= 0)):

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safemr.certificates.certificate import EnergyCertificate
-from safemr.certificates.energy import energy, largest
+from safemr.certificates.energy import largest
 from safemr.certificates.falsification import make_simulator
+from safemr.certificates.families import Parameters, phi_at
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
 from safemr.files import Arrays
 from safemr.learning.evaluation import Acts
 from safemr.measure.store import Measurements
 from safemr.measure.tracks import GEOMETRY
-from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def multipliers(policy: Policy, observations: NDArray[Any]) -> NDArray[np.float6
 
 def multiplier_map(
     policy: Policy,
-    zeta: Zeta,
+    zeta: Parameters,
     task: Task,
     *,
     seed: int = 0,
@@ -129,7 +129,7 @@ def multiplier_map(
         envs.set_state(state)
         observations, *_, infos = envs.step(np.zeros((points, 2), np.float32))
         multiplier[row] = multipliers(policy, observations)
-        phi[row] = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        phi[row] = largest(phi_at(infos["d"], infos["d_dot"], envs.d_min, zeta))
         multiplier[row, infos["d"].min(1) < envs.d_min] = np.nan
         reached = np.array([envs.scene(index).robot[:2] for index in range(points)])
         moved[row] = reached - worlds["start"][:, :2]
@@ -160,7 +160,7 @@ def measured(
     record = certificate.record
     assert record is not None
     inputs = {
-        "policy": record.inputs, "zeta": list(certificate.zeta),
+        "policy": record.inputs, **certificate.entry,
         "task": installed(task),
         "layouts": layouts, "steps": steps,
     }  # fmt: skip
