@@ -4,6 +4,7 @@ load_policy      the trained policy of a record, to act with
 read_records     all records under a results root as tables
 evaluate_record  a recorded policy on layouts of its task
 make_envs        a batched environment of a task
+train            one run on a task of this package or on an environment from outside
 UserError        what all of them raise where the user can fix it
 
 Each is imported when it is first asked for: `import safemr` itself costs nothing. Within the
@@ -18,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from safemr.errors import UserError
     from safemr.experiment.records import read_records
+    from safemr.experiment.runs import train
     from safemr.learning.policies import load_policy
     from safemr.measure.evaluate import evaluate_record
     from safemr.tasks import make_envs
 
-__all__ = ["UserError", "evaluate_record", "load_policy", "make_envs", "read_records"]
+__all__ = ["UserError", "evaluate_record", "load_policy", "make_envs", "read_records", "train"]
 
 _HOMES = {
     "UserError": "safemr.errors",
@@ -30,6 +32,7 @@ _HOMES = {
     "load_policy": "safemr.learning.policies",
     "make_envs": "safemr.tasks",
     "read_records": "safemr.experiment.records",
+    "train": "safemr.experiment.runs",
 }
 
 

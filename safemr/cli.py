@@ -4,6 +4,7 @@ safemr train ...      train one run
 safemr evaluate ...   evaluate a recorded policy
 safemr certify ...    check a learned energy function
 safemr records ...    verify the records under a results root and say what is unfinished
+safemr check ID ...   what an environment from outside has and lacks (docs/your-own.md)
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
 safemr documents ...  put the tables that the pipeline made into documents
@@ -27,6 +28,7 @@ COMMANDS = {
     "evaluate": "safemr.measure.evaluate",
     "certify": "safemr.report.certificates",
     "records": "safemr.experiment.overview",
+    "check": "safemr.experiment.check",
     "list": "safemr.experiment.listing",
     "config": "safemr.experiment.config",
     "documents": "safemr.report.documents",

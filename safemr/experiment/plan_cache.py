@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib.util
 import json
+from pathlib import Path
 from typing import Any
 
 from safemr import files
@@ -17,6 +19,7 @@ from safemr import tasks as tasks_of
 from safemr.experiment import planning
 from safemr.experiment.config import Config
 from safemr.experiment.roles import Variants
+from safemr.experiment.task_entries import ForeignTask
 from safemr.files import REPOSITORY
 
 
@@ -49,7 +52,23 @@ def _key(config: Config) -> str:
     for package in ("envs", "safemr"):
         for source in sorted((REPOSITORY / package).rglob("*.py")):
             digest.update(source.relative_to(REPOSITORY).as_posix().encode() + source.read_bytes())
+    for task in config.task_variants.values():
+        if isinstance(task, ForeignTask):
+            for source in _sources(task.id):
+                digest.update(source.as_posix().encode() + source.read_bytes())
     return digest.hexdigest()
+
+
+def _sources(identity: str) -> list[Path]:
+    """The files of the package that registers an environment; none where it is not installed."""
+    package = identity.rpartition(":")[0].partition(".")[0]
+    spec = importlib.util.find_spec(package) if package else None
+    if spec is None:
+        return []
+    if spec.submodule_search_locations is None:
+        return [Path(spec.origin)] if spec.origin else []
+    folders = map(Path, spec.submodule_search_locations)
+    return sorted(source for folder in folders for source in folder.rglob("*.py"))
 
 
 def _from_json(saved: dict[str, Any]) -> planning.Plan:
