@@ -1,4 +1,4 @@
-"""Environments that know nothing of `safemr`: a point on a line, and the same with one fault each."""
+"""Environments that know nothing of `safemr`: a point on a line, whole and with one fault each."""
 
 from __future__ import annotations
 

@@ -19,10 +19,10 @@ MOST = 4  # discs
 
 
 class UnicycleDiscs(gymnasium.Env):
-    """State: position [m], heading [rad] and speed [m/s]. Action: acceleration and turning rate.
+    """State: position [m], heading [rad] and speed [m/s]. Action: speed and turning rate wanted.
 
-    disc_speed: of every disc [m/s]. The reward is the way gained towards the goal [m], and 1 when
-    it is reached, whereupon another one is drawn.
+    The speed follows with a lag of two steps. disc_speed: of every disc [m/s]. The reward is the
+    way gained towards the goal [m], and 1 when it is reached, whereupon another one is drawn.
     """
 
     d_min = 0.35  # from the centre of a disc [m]
@@ -31,8 +31,8 @@ class UnicycleDiscs(gymnasium.Env):
 
     def __init__(self, disc_speed: float = 0.2) -> None:
         self.disc_speed = disc_speed
-        # Acceleration [m/s^2] and turning rate [rad/s].
-        self.action_space = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]), dtype=np.float64)
+        # [m/s] and [rad/s].
+        self.action_space = Box(np.array([-0.5, -2.0]), np.array([1.0, 2.0]), dtype=np.float64)
         # Speed, then the goal's and each disc's place, and each disc's velocity, as the robot sees
         # them. Only the speed has bounds.
         limit = np.full(3 + 4 * MOST, np.inf)
@@ -54,9 +54,9 @@ class UnicycleDiscs(gymnasium.Env):
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        acceleration, turning = np.clip(action, self.action_space.low, self.action_space.high)
+        wanted, turning = np.clip(action, self.action_space.low, self.action_space.high)
         before = np.linalg.norm(self.goal - self.place)
-        self.speed = float(np.clip(self.speed + DT * acceleration, -1.0, 1.0))
+        self.speed += 0.5 * (wanted - self.speed)
         self.heading += DT * turning
         self.place = self.place + DT * self._velocity()
         self.discs += DT * self.velocities
@@ -65,12 +65,12 @@ class UnicycleDiscs(gymnasium.Env):
             outside, -np.sign(self.discs) * np.abs(self.velocities), self.velocities
         )
         after = np.linalg.norm(self.goal - self.place)
-        reward = float(before - after)
-        if after < 0.3:
-            reward += 1.0
+        reached = bool(after < 0.3)
+        if reached:
             self._draw_goal()
+        reward = float(before - after) + reached
         info = self._info()
-        info["cost"] = float((info["d"] < self.d_min).any())
+        info |= {"cost": float((info["d"] < self.d_min).any()), "goal_met": reached}
         return self._observation(), reward, False, False, info
 
     def _velocity(self) -> np.ndarray:
