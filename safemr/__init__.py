@@ -8,6 +8,7 @@ make_envs        a batched environment of a task
 SafetyFilter     a wrapper of Gymnasium that keeps actions within a certificate
 filter_actions   the same without an environment
 EnergyCertificate, Zeta  the paper's family of certificates, and its sigma, k and n
+train            one run on a task of this package or on an environment from outside
 UserError        what all of them raise where the user can fix it
 
 Each is imported when it is first asked for: `import safemr` itself costs nothing. Within the
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from safemr.experiment.records import read_records
     from safemr.filters.filter import filter_actions
     from safemr.filters.wrapper import SafetyFilter
+    from safemr.experiment.runs import train
     from safemr.learning.policies import load_policy
     from safemr.measure.evaluate import evaluate_record
     from safemr.paper import Zeta
@@ -42,6 +44,7 @@ __all__ = [
     "load_policy",
     "make_envs",
     "read_records",
+    "train",
 ]
 
 _HOMES = {
@@ -55,6 +58,7 @@ _HOMES = {
     "load_policy": "safemr.learning.policies",
     "make_envs": "safemr.tasks",
     "read_records": "safemr.experiment.records",
+    "train": "safemr.experiment.runs",
 }
 
 

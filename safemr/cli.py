@@ -6,6 +6,7 @@ safemr certify ...    check a learned energy function
 safemr play RECORD .. draw an episode of a policy, with phi and the filter's interventions
 safemr records ...    verify the records under a results root and say what is unfinished
 safemr check-algorithm NAME  check that an algorithm keeps to the contract of a trainer
+safemr check ID ...   what an environment from outside has and lacks (docs/your-own.md)
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
 safemr documents ...  put the tables that the pipeline made into documents
@@ -31,6 +32,7 @@ COMMANDS = {
     "play": "safemr.report.play",
     "records": "safemr.experiment.overview",
     "check-algorithm": "safemr.experiment.check_algorithm",
+    "check": "safemr.experiment.check",
     "list": "safemr.experiment.listing",
     "config": "safemr.experiment.config",
     "documents": "safemr.report.documents",

@@ -83,6 +83,8 @@ def sources(name: str) -> list[Path]:
     spec = None
     with contextlib.suppress(ImportError, ValueError):
         spec = importlib.util.find_spec(package_of(name))
+    if spec is not None and spec.submodule_search_locations is None:  # a package of one file
+        return [Path(spec.origin)] if spec.origin else []
     folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
     return sorted(path for folder in folders for path in folder.rglob("*.py"))
 

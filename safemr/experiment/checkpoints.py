@@ -256,12 +256,18 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
             tell(f"stopped by {reason} at step {step}; the same command continues {here}")
             raise SystemExit(128 + (self._signals.received or signal.SIGTERM))
 
-    def finish(self, policy: Mapping[str, np.ndarray] | None) -> None:
-        """Write the record, provenance last, and remove everything unfinished."""
+    def finish(
+        self, policy: Mapping[str, np.ndarray] | None, notes: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write the record, provenance last, and remove everything unfinished.
+
+        notes: what else the provenance says.
+        """
         attempts = read_attempts(self.work)
         origin = {
             **provenance.collect(),
             **self._outside,
+            **(notes or {}),
             **{name: round(value, 3) for name, value in self.elapsed().items()},
             "started": next((e["started"] for e in attempts if "started" in e), None),
             "finished": provenance.now(),

@@ -35,6 +35,7 @@ from safemr.experiment.sections import (
     seeds_in,
 )
 from safemr.experiment.strict_yaml import read_yaml, typed
+from safemr.experiment.task_entries import ForeignTask
 from safemr.files import REPOSITORY
 from safemr.learning.interface import Interface
 from safemr.names import unknown
@@ -135,7 +136,8 @@ class Config:
     """A validated configuration; see config/config.yaml for the meaning of each key."""
 
     tasks: tuple[str, ...]
-    task_variants: Mapping[str, TaskVariant]  # of those tasks that are not registered ones
+    # of those tasks that are not registered ones
+    task_variants: Mapping[str, TaskVariant | ForeignTask]
     algorithms: Mapping[str, Variant]
     seeds: tuple[int, ...]
     budget: Mapping[str, int]
@@ -252,11 +254,12 @@ _TOP_LEVEL = (
 )
 
 
-def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
+def _tasks(value: Any, where: str) -> dict[str, TaskVariant | ForeignTask | None]:
     """Names of tasks, and what each is where it is no registered one.
 
-    A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
-    mapping of all names, those of registered tasks with nothing behind them.
+    A list of names, in which ``{name: {base, settings}}`` is a task with other settings and
+    ``{name: {id, ...}}`` one from outside, or one mapping of all names, those of registered tasks
+    with nothing behind them.
     """
     parts = [value] if isinstance(value, Mapping) and value else listed(value, where)
     entries = [
@@ -272,9 +275,11 @@ def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
     }
 
 
-def _task_variant(value: Any, where: str) -> TaskVariant | None:
+def _task_variant(value: Any, where: str) -> TaskVariant | ForeignTask | None:
     if value is None or value == {}:
         return None
+    if isinstance(value, Mapping) and "id" in value:
+        return ForeignTask.read(value, where)
     section = Section(value, where, ("base", "settings"))
     return TaskVariant(
         checked_name(section.required("base"), f"{where}.base"),

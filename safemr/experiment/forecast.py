@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from safemr.experiment.planning import Run
 from safemr.experiment.record import Record
 from safemr.experiment.records import RecordError
-from safemr.tasks import name_of
+from safemr.tasks import Described, is_foreign, name_of
 
 
 class Cost(NamedTuple):
@@ -45,6 +45,17 @@ def announced(root: Path, runs: Sequence[Run]) -> list[str]:
         places = ", ".join(f"{task} {count}" for task, count in counts.items())
         lines.append(f"  {variant}: {places}")
     return lines
+
+
+def left_out(tasks: Mapping[str, Described]) -> list[str]:
+    """Lines about what is not made for tasks whose environment cannot tell it."""
+    without = [name for name, task in tasks.items() if is_foreign(task.entry)]
+    if not without:
+        return []
+    return [
+        f"{', '.join(without)}: curves, tables, claims and reports; no check of certificates, "
+        "which asks for a model of the robot, and no trajectories, which ask for a scene to draw"
+    ]
 
 
 def _opened(folder: Path) -> Record | None:

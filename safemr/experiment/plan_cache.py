@@ -17,6 +17,7 @@ from safemr import tasks as tasks_of
 from safemr.experiment import planning
 from safemr.experiment.config import Config
 from safemr.experiment.roles import Variants
+from safemr.experiment.task_entries import ForeignTask
 from safemr.files import REPOSITORY
 
 
@@ -55,7 +56,7 @@ def _key(config: Config) -> str:
 
 
 def _modules(config: Config) -> list[str]:
-    """The modules of other packages that a configuration names, algorithms and energies."""
+    """The modules of other packages that a configuration names: algorithms, energies, tasks."""
     parts = (config.algorithms, config.aircraft.algorithms if config.aircraft else {})
     variants = [variant for part in parts for variant in part.values()]
     chosen = [variant.overrides for variant in variants]
@@ -70,7 +71,9 @@ def _modules(config: Config) -> list[str]:
         for group, names in named.items()
         for name in names
     }
-    return sorted(filter(packages.is_outside, modules))
+    tasks = [task for task in config.task_variants.values() if isinstance(task, ForeignTask)]
+    registering = {task.id.rpartition(":")[0] for task in tasks} - {""}
+    return sorted({*filter(packages.is_outside, modules), *registering})
 
 
 def _from_json(saved: dict[str, Any]) -> planning.Plan:

@@ -20,16 +20,19 @@ from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorit
 from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
 from safemr.experiment.roles import Variants
+from safemr.experiment.task_entries import ForeignTask as ForeignTask
 from safemr.experiment.task_entries import check_name as check_name
+from safemr.experiment.task_entries import describe_foreign as describe_foreign
 from safemr.experiment.task_entries import describe_task as describe_task
 from safemr.experiment.task_entries import described as described
 from safemr.experiment.task_entries import fitted_interface as fitted_interface
 from safemr.experiment.task_entries import installed as installed
+from safemr.experiment.task_entries import is_id as is_id
 from safemr.experiment.task_entries import task_names as task_names
 from safemr.learning.hyperparameters import Setting
 from safemr.learning.interface import Interface
 from safemr.names import unknown
-from safemr.tasks import Described, base_of, settings_of, task_settings
+from safemr.tasks import OPTIONS, Described, base_of, settings_of, task_settings
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,12 @@ def check_setting(
     Raises:
         UserError: it names the hyperparameter, and what it may be there.
     """
+    if algorithm.certificate is not None and not described(task).traits.distances:
+        raise UserError(
+            f"{where} on {task['name']}: {algorithm.name} has an energy function, and the "
+            "environment reports no d and d_dot; report them (safemr check "
+            f"{task.get('id', '')}), or choose an algorithm without one"
+        )
     check = getattr(algorithm.hyperparameters(**values), "check_setting", None)
     if check is None:  # an algorithm that does without `safemr.learning.hyperparameters`
         return
@@ -331,6 +340,10 @@ class _Resolver:
             check_name(entry, f"task_overrides.{name}.settings", remedy)
             return entry
         where = f"tasks.{name}"
+        if isinstance(variant, ForeignTask):
+            if given:
+                raise UserError(f"task_overrides.{name}.settings belong into {where}.settings")
+            return describe_foreign(name, variant, where)
         if not variant.settings:
             raise UserError(f"{where}.settings is empty: then it is {variant.base} itself")
         describe_task(variant.base, variant.settings, where)
@@ -371,6 +384,7 @@ def _check_distinct(plan: Plan) -> None:
             )
     names: dict[str, str] = {}
     for name, task in plan.tasks.items():
-        same = records.canonical_json([base_of(task.entry), settings_of(task.entry)])
+        options = [task.entry.get(option) for option in OPTIONS]
+        same = records.canonical_json([base_of(task.entry), settings_of(task.entry), options])
         if names.setdefault(same, name) != name:
             raise UserError(f"{names[same]!r} and {name!r} are the same task; remove one")

@@ -18,16 +18,17 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from safemr.certificates import families
 from safemr.conventions import evaluation_seed
-from safemr.environments import SafetyEnvs, check_envs
+from safemr.environments import SafetyEnvs, check_envs, exact_resume
 from safemr.errors import UserError, tell
 from safemr.experiment import planning, records
 from safemr.experiment.config import WANDB_MODES
+from safemr.experiment.provenance import distribution_of
 from safemr.experiment.sections import checked_name
 from safemr.experiment.signals import StoppedError, StopSignals
 from safemr.experiment.strict_yaml import assignment
 from safemr.learning.interface import Interface
 from safemr.paper import Zeta
-from safemr.tasks import make_envs
+from safemr.tasks import is_foreign, make_envs
 
 if TYPE_CHECKING:
     from safemr.experiment.checkpoints import RunSession
@@ -133,7 +134,10 @@ def train(
             progress.show(row)
             wandb_log.log(row)
             session.maybe_checkpoint(trainer.state_dict)
-    session.finish(trainer.policy.arrays())
+    notes: dict[str, Any] = {} if exact_resume(evaluation_envs) else {"exact_resume": False}
+    if is_foreign(config["task"]):
+        notes["task_package"] = distribution_of(config["task"]["id"].partition(":")[0])
+    session.finish(trainer.policy.arrays(), notes)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -146,7 +150,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     asked = {"-h", "--help"} & set(sys.argv[1:] if argv is None else argv)
     tasks = ", ".join(planning.task_names()) if asked else ""  # imports the simulator
-    parser.add_argument("--task", help=f"one of {tasks}")
+    parser.add_argument(
+        "--task",
+        help=f"one of {tasks}, or Gymnasium's id of an environment from outside, with the package "
+        "that registers it (my_package:MyTask-v0, docs/your-own.md)",
+    )
     parser.add_argument("--task-name", help="what the task is called with settings of its own")
     parser.add_argument("--algorithm", help=f"one of {', '.join(planning.algorithm_names())}")
     parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
@@ -199,7 +207,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
-    overrides = dict(map(assignment, arguments.set))
+    overrides = dict(one if isinstance(one, tuple) else assignment(one) for one in arguments.set)
     settings, asked = (
         {
             name.removeprefix(prefix): overrides.pop(name)
@@ -237,6 +245,10 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The task's entry; settings that make another task of it need a name."""
+    if planning.is_id(arguments.task):
+        foreign = planning.ForeignTask.said(arguments.task, settings, "--task")
+        name = checked_name(arguments.task_name or foreign.name, "--task-name")
+        return planning.describe_foreign(name, foreign, "it with --task-name")
     if arguments.task_name is None:
         task = planning.describe_task(arguments.task, settings, "--task")
         planning.check_name(task, "--set", "give it with --task-name")

@@ -83,6 +83,10 @@ class EpisodeStatistics:
             "episodes": float(len(table)),
         }
 
+    def abandon(self) -> None:
+        """Forgets the running episodes, which nobody will finish."""
+        self._running[:] = 0.0
+
     def state_dict(self) -> dict[str, Any]:
         return {"running": self._running.copy(), "finished": self.finished}
 

@@ -1,17 +1,20 @@
 """From an environment's raw observation to what the networks see: fixed columns, scales and clips.
 
-There are no running statistics: the transform is a constant of the task, so training, evaluation
-and a saved policy can never disagree about it.
+The transform is a constant of the task, so training, evaluation and a saved policy can never
+disagree about it. Only an environment from outside, of which no sensor is known, may need running
+statistics beside it (`safemr.learning.normalisation`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from safemr.environments import SafetyEnvs, bounded
 from safemr.errors import UserError
 
 
@@ -41,6 +44,8 @@ BLOCKS: Mapping[str, Block] = {
 BINS = 16  # of a lidar
 DECODED = 4  # numbers that stand for a decoded lidar
 
+NO_COLUMNS = np.zeros(0, np.int64)
+
 UNREAD_TAIL = 1  # columns after the last one read: the vertical component of a layout's last sensor
 
 
@@ -66,6 +71,8 @@ class ObservationTransform:
     type, any order in memory) to float32 [N, dim] in Fortran order. width is the raw observations'
     number of columns, which a saved policy does not say unless it decodes: ``lidars`` are the first
     columns of decoded lidars, and columns from width on are those of `decoded`, lidar by lidar.
+    ``shift`` [dim] float64 is subtracted first; ``unscaled`` are the columns of the output that
+    nothing is known of.
     """
 
     def __init__(
@@ -75,10 +82,34 @@ class ObservationTransform:
         clip: NDArray[np.float32],
         width: int | None = None,
         lidars: tuple[int, ...] = (),
+        shift: NDArray[np.float64] | None = None,
+        unscaled: NDArray[np.int64] = NO_COLUMNS,
     ) -> None:
         self.columns, self.scale, self.clip, self.width = columns, scale, clip, width
-        self.lidars = lidars
+        self.lidars, self.shift, self.unscaled = lidars, shift, unscaled
         self._clipped = np.flatnonzero(np.isfinite(clip))
+
+    @classmethod
+    def for_envs(cls, envs: SafetyEnvs, decode: Iterable[str] = ()) -> ObservationTransform:
+        """By the environments' ``observation_layout``, or by their space where they have none."""
+        if envs.observation_layout:
+            return cls.for_layout(envs.observation_layout, decode)
+        return cls.for_space(envs.single_observation_space)
+
+    @classmethod
+    def for_space(cls, space: Any) -> ObservationTransform:
+        """For a Box [D]: columns with finite bounds are mapped onto [-1, 1]."""
+        low, high = (np.array(bound, float) for bound in (space.low, space.high))
+        within = bounded(space)
+        low, high = np.where(within, low, -1.0), np.where(within, high, 1.0)
+        return cls(
+            np.arange(len(low)),
+            (2.0 / (high - low)).astype(np.float32),
+            np.full(len(low), np.inf, np.float32),
+            len(low),
+            shift=(high + low) / 2.0,
+            unscaled=np.flatnonzero(~within),
+        )
 
     @classmethod
     def for_layout(
@@ -136,7 +167,8 @@ class ObservationTransform:
         if self.lidars:
             parts = [decoded(observations[..., at : at + BINS]) for at in self.lidars]
             observations = np.concatenate((observations, *parts), -1)
-        out = observations[..., self.columns].astype(np.float32)
+        out = observations[..., self.columns]
+        out = (out if self.shift is None else out - self.shift).astype(np.float32)
         out *= self.scale
         if len(self._clipped):
             bound = self.clip[self._clipped]

@@ -14,6 +14,7 @@ from torch import Tensor
 from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
 from safemr.learning.episode_statistics import EpisodeStatistics
 from safemr.learning.interface import control_steps, interface_of
+from safemr.learning.normalisation import Normaliser
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
 from safemr.learning.replay import Replay
@@ -42,9 +43,8 @@ class Trainer:
         if not isinstance(space, gym.spaces.Box):
             raise TypeError(f"continuous actions are required, found {space}")
         action_dim = int(np.prod(space.shape))
-        self.transform = ObservationTransform.for_layout(
-            self.envs.observation_layout, self.interface.decode
-        )
+        self.transform = ObservationTransform.for_envs(self.envs, self.interface.decode)
+        self.normaliser = Normaliser(self.transform, total_steps)
         steps_an_update = config.update_every * self.interface.action_repeat
         updates = max(total_steps - config.start_steps, 0) // steps_an_update
         self._exploring_until = config.explore_until * total_steps
@@ -70,6 +70,8 @@ class Trainer:
         observations, infos = self.envs.reset(seed=environment_seed(seed, 4))
         self._observations: NDArray[np.float32] = self.transform(observations)
         self._features = self._energy_features(infos)
+        self.normaliser.observe(self._observations, self.step)
+        self.normaliser.follow()
 
     @staticmethod
     def _energy_features(infos: Mapping[str, Any]) -> NDArray[np.float32]:
@@ -91,6 +93,7 @@ class Trainer:
                 continue
             self._owed -= updates
             drawn = self.replay.sample(updates * config.batch_size, self._sampling)
+            drawn = self.normaliser.batch(drawn)
             done = self.agent.updates
             measure = (done + updates) // MEASURE_EVERY > done // MEASURE_EVERY
             info = self.agent.update(drawn, updates, measure)
@@ -113,7 +116,8 @@ class Trainer:
                 self._held.uniform_(-1.0, 1.0, generator=self._random_actions)
             action = self._held
         else:
-            action = self.agent.act(torch.from_numpy(self._observations).to(device)).cpu()
+            seen = torch.from_numpy(self.normaliser(self._observations))
+            action = self.agent.act(seen.to(device)).cpu()
             check_finite(self.step, {"action": float(action.sum())})
             if config.explore_share > 0.0:
                 action = self._explore(action)
@@ -141,6 +145,8 @@ class Trainer:
         self._episodes.update(rewards, terminated, truncated, infos)
         self._observations, self._features = observations, features
         self.step += control_steps(infos, config.num_envs)
+        self.normaliser.observe(reached, self.step)
+        self.normaliser.follow()
 
     def _explore(self, actions: Tensor) -> Tensor:
         """The policy's actions [N, A], or random ones that are held for several decisions.
@@ -168,7 +174,7 @@ class Trainer:
     def policy(self) -> Policy:
         """The current policy with what figures need of the run: lambda's network and zeta."""
         return Policy(
-            self.transform,
+            self.normaliser.settled(self.transform),
             self.agent.policy,
             squash=True,
             extras=self.agent.extras(),
@@ -188,6 +194,7 @@ class Trainer:
             "episodes": self._episodes.state_dict(),
             "observations": self._observations,
             "features": self._features,
+            "normaliser": self.normaliser.state_dict(),
             "envs": self.envs.get_state(),
         }
 
@@ -204,4 +211,12 @@ class Trainer:
         # np.array keeps the order in memory, which decides how products with them round.
         self._observations = np.array(state["observations"], np.float32)
         self._features = np.array(state["features"], np.float32)
-        self.envs.set_state(state["envs"])
+        if "normaliser" in state:
+            self.normaliser.load_state_dict(state["normaliser"])
+        begun = self.envs.set_state(state["envs"])
+        if begun is not None:
+            observations, infos = begun
+            self._observations = self.transform(observations)
+            self._features = self._energy_features(infos)
+            self._episodes.abandon()
+            self.replay.cut()

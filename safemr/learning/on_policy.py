@@ -22,6 +22,7 @@ from safemr.learning.gaussian import GaussianActor, entropy, log_density, ratio_
 from safemr.learning.hyperparameters import Hyperparameters, Setting
 from safemr.learning.interface import control_steps, interface_of
 from safemr.learning.networks import ACTIVATIONS, Activation, StackedMLP
+from safemr.learning.normalisation import Normaliser
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
 from safemr.learning.rollouts import Batch, Rollout, gae, minibatches
@@ -125,9 +126,8 @@ class OnPolicyTrainer(ABC):
         self.config, self.step = config, 0
         self.envs = make_envs(config.num_envs)
         self.interface = interface_of(self.envs)
-        self.transform = ObservationTransform.for_layout(
-            self.envs.observation_layout, self.interface.decode
-        )
+        self.transform = ObservationTransform.for_envs(self.envs, self.interface.decode)
+        self.normaliser = Normaliser(self.transform, total_steps)
         inputs, actions = self.transform.dim, int(np.prod(self.envs.single_action_space.shape))
         sizes, weights = (inputs, config.hidden, config.hidden), generator(seed, 0)
         network = StackedMLP(
@@ -148,6 +148,8 @@ class OnPolicyTrainer(ABC):
         )
         self.statistics = EpisodeStatistics(config.num_envs)
         self.observations, _ = self.envs.reset(seed=environment_seed(seed, 3))
+        self._seen(self.observations)
+        self.normaliser.follow()
 
     def _fused(self) -> FusedSteps:
         from safemr.learning.on_policy_steps import FusedSteps  # compiled when it is asked for
@@ -158,7 +160,7 @@ class OnPolicyTrainer(ABC):
     def policy(self) -> Policy:
         """The current policy; it follows further training."""
         return Policy(
-            self.transform,
+            self.normaliser.settled(self.transform),
             self.actor.network,
             squash=False,
             log_std=self.actor.log_std.detach(),
@@ -182,12 +184,20 @@ class OnPolicyTrainer(ABC):
         check_finite(self.step, metrics)
         return metrics
 
+    def _seen(self, observations: np.ndarray) -> np.ndarray:
+        """Raw observations [N, obs] as the networks see them in this epoch, [N, D]."""
+        read = self.transform(observations)
+        self.normaliser.observe(read, self.step)
+        return self.normaliser(read)
+
     def _epoch(self) -> dict[str, float]:
         batch, metrics = self._collect()
         metrics |= self.update_policy(batch)
         metrics["kl"] = self._divergence(batch)
         metrics["entropy"] = entropy(self.actor.log_std)
-        return metrics | self._fit_critics(batch)
+        metrics |= self._fit_critics(batch)
+        self.normaliser.follow()  # between two epochs: one rollout is read in one way
+        return metrics
 
     @torch.no_grad()
     def _divergence(self, batch: Batch) -> float:
@@ -216,16 +226,16 @@ class OnPolicyTrainer(ABC):
         noise = std * torch.randn(rollout.actions.shape, generator=self.noise)
         with torch.no_grad():
             for perturbation in noise.numpy():
-                inputs = self.transform(self.observations)
+                inputs = self._seen(self.observations)
                 actions = self._act(inputs, perturbation)
                 self.observations, rewards, terminated, truncated, infos = self.envs.step(actions)
                 self.statistics.update(rewards, terminated, truncated, infos)
                 steps += control_steps(infos, config.num_envs)
                 finals = None
                 if truncated.any():
-                    finals = self.transform(infos["final_obs"])
+                    finals = self._seen(infos["final_obs"])
                 rollout.add(inputs, actions, rewards, infos["cost"], terminated, truncated, finals)
-            rollout.close(self.transform(self.observations))
+            rollout.close(self._seen(self.observations))
         self.step += steps
         return self._batch(episodes_before, steps)
 
@@ -316,6 +326,7 @@ class OnPolicyTrainer(ABC):
             "order": self.order.get_state(),
             "observations": self.observations,
             "statistics": self.statistics.state_dict(),
+            "normaliser": self.normaliser.state_dict(),
             "envs": self.envs.get_state(),
         }
 
@@ -328,4 +339,9 @@ class OnPolicyTrainer(ABC):
         self.order.set_state(state["order"])
         self.observations = np.array(state["observations"])  # in the same order in memory
         self.statistics.load_state_dict(state["statistics"])
-        self.envs.set_state(state["envs"])
+        if "normaliser" in state:
+            self.normaliser.load_state_dict(state["normaliser"])
+        begun = self.envs.set_state(state["envs"])
+        if begun is not None:
+            self.observations, _ = begun
+            self.statistics.abandon()

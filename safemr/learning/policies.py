@@ -118,6 +118,9 @@ class Policy:
         }
         if self.log_std is not None:
             arrays["log_std"] = self.log_std.detach().cpu().numpy().copy()
+        if self.transform.shift is not None:
+            arrays["shift"] = self.transform.shift
+            arrays["width"] = np.array(self.transform.width, np.int64)
         if self.transform.lidars:
             arrays["lidars"] = np.array(self.transform.lidars, np.int64)
             arrays["width"] = np.array(self.transform.width, np.int64)
@@ -135,6 +138,7 @@ class Policy:
             arrays["clip"],
             int(arrays["width"]) if "width" in arrays else None,
             tuple(int(start) for start in arrays.get("lidars", ())),
+            arrays.get("shift"),
         )
         interface = Interface(
             int(arrays.get("action_repeat", 1)), tuple(map(float, arrays.get("action_scale", ())))
@@ -142,7 +146,7 @@ class Policy:
         log_std = torch.from_numpy(arrays["log_std"]) if "log_std" in arrays else None
         known = {
             *("squash", "columns", "scale", "clip", "log_std"),
-            *("lidars", "width", "action_repeat", "action_scale"),
+            *("lidars", "width", "action_repeat", "action_scale", "shift"),
         }
         extras = {
             key: value
