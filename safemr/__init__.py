@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from safemr.errors import UserError
     from safemr.experiment.loaded import load
     from safemr.experiment.records import read_records
+    from safemr.experiment.runs import train
     from safemr.filters.filter import filter_actions
     from safemr.filters.wrapper import SafetyFilter
-    from safemr.experiment.runs import train
     from safemr.learning.policies import load_policy
     from safemr.measure.evaluate import evaluate_record
     from safemr.paper import Zeta
