@@ -76,7 +76,7 @@ class Uniform(gymnasium.Wrapper):
         super().__init__(env)
         self._label, self._obstacles = label, obstacles
         self._spaces = env.observation_space, env.action_space
-        flat = gymnasium.spaces.flatten_space(env.observation_space)
+        flat: Any = gymnasium.spaces.flatten_space(env.observation_space)
         self.observation_space = gymnasium.spaces.Box(
             flat.low.astype(float), flat.high.astype(float), flat.shape, np.float64
         )
@@ -96,16 +96,17 @@ class Uniform(gymnasium.Wrapper):
 
     def _vector(self, observation: Any) -> Floats:
         try:
-            vector = gymnasium.spaces.flatten(self._spaces[0], observation)
+            vector: Any = gymnasium.spaces.flatten(self._spaces[0], observation)
         except Exception as error:
             raise UserError(
                 f"{self._label}: an observation is none of its space: {first_line(error)}; "
                 "return what observation_space says"
             ) from error
-        if vector.shape != self.observation_space.shape:
+        (width,) = self.observation_space.shape or (0,)
+        if vector.shape != (width,):
             raise UserError(
-                f"{self._label}: an observation has {vector.size} numbers, its space "
-                f"{self.observation_space.shape[0]}; return what observation_space says"
+                f"{self._label}: an observation has {vector.size} numbers, its space {width}; "
+                "return what observation_space says"
             )
         return vector.astype(float)
 
@@ -163,7 +164,7 @@ class ForeignEnvs:
         self._action = acted
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._low.size,), np.float32)
         self._seed, self._steps = 0, 0
-        self._observations = np.zeros((self.num_envs, len(low)))
+        self._observations: Floats = np.zeros((self.num_envs, len(low)))
         self._d = np.full((self.num_envs, self.num_obstacles), FAR * self.d_min)
         self._d_dot = np.zeros_like(self._d)
 

@@ -70,10 +70,10 @@ def spec_of(identity: str, label: str) -> EnvSpec:
         try:
             importlib.import_module(module)
         except Exception as error:  # whatever is wrong with it, its author wants to know
-            missing = isinstance(error, ModuleNotFoundError) and error.name is not None
-            if missing and (module == error.name or module.startswith(f"{error.name}.")):
+            missing = error.name if isinstance(error, ModuleNotFoundError) else None
+            if missing and (module == missing or module.startswith(f"{missing}.")):
                 raise UserError(
-                    f"{label}: there is no package {error.name}; install it, or put the folder "
+                    f"{label}: there is no package {missing}; install it, or put the folder "
                     "that it lies in into PYTHONPATH"
                 ) from error
             raise UserError(f"{label}: {module} does not import: {first_line(error)}") from error

@@ -207,7 +207,9 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
-    overrides = dict(one if isinstance(one, tuple) else assignment(one) for one in arguments.set)
+    overrides: dict[str, Any] = dict(
+        one if isinstance(one, tuple) else assignment(one) for one in arguments.set
+    )
     settings, asked = (
         {
             name.removeprefix(prefix): overrides.pop(name)
