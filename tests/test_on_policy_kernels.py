@@ -36,12 +36,16 @@ SMALL: dict[str, Any] = {
 
 
 class WideEnvs(ToyEnvs):
-    """The toy as an environment of 5 observations and 2 actions; only its spaces are used."""
+    """The toy as an environment of 5 observations and 2 actions; only its start is used."""
 
     def __init__(self, num_envs: int) -> None:
         super().__init__(num_envs)
         self.observation_layout = {"x": slice(0, INPUTS)}
         self.single_action_space.__init__(-1.0, 1.0, (ACTIONS,), np.float32)
+
+    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        observations, infos = super().reset(**options)
+        return observations.repeat(INPUTS, 1), infos
 
 
 def make(name: str, backend: str, envs: Any = WideEnvs, **overrides: Any) -> Any:
