@@ -16,7 +16,7 @@ from safemr.certificates.families import Parameter
 VERSION = 1
 
 PARAMETERS = {
-    "sigma": Parameter(start=0.1, low=0.02, high=1.0, metres=1),  # margin beyond d_min [m]
+    "sigma": Parameter(start=0.2, low=0.05, high=1.0, metres=1),  # margin beyond d_min [m]
     "u": Parameter(start=1.0, low=0.2, high=10.0, metres=1),  # deceleration [m/s^2]
     "t": Parameter(start=0.3, low=0.05, high=2.0),  # reaction time [s]
 }
