@@ -17,6 +17,7 @@ import argparse
 import csv
 import functools
 import importlib
+import statistics
 import time
 from collections.abc import Callable
 from typing import Any
@@ -24,6 +25,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.training import Stopwatch
+from safemr.learning.interface import Interface
 from safemr.tasks import make_envs
 
 ALGORITHMS = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
@@ -39,6 +42,17 @@ OMNISAFE = {
 }
 OMNISAFE_STEPS_PER_SECOND = 140.0
 PARTS = ("_collect", "update_policy", "_fit_critics")
+BACKENDS = ("torch", "fused")
+HELD = {"num_envs": 16, "epoch_steps": 16_000, "value_batch": 320}
+COMPARED = (  # task, how its learner meets it, hyperparameters of all, and of PPO-Lagrangian
+    ("Pillars-0.15-Goal", Interface(), {}, {}),
+    (
+        "Hazards-0.30-Push",
+        Interface(5, (0.05, 1.0), ("single",)),
+        HELD,
+        {"policy_batch": 320},
+    ),
+)
 
 
 def timed(trainer: Any, spent: dict[str, float]) -> None:
@@ -87,13 +101,62 @@ def measure(
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--task", default="Pillars-0.15-Goal")
-    parser.add_argument("--epochs", type=int, default=3)
-    parser.add_argument("--output", help="also write the table to this CSV file")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
+def compare(
+    algorithm: str,
+    task: str,
+    interface: Interface,
+    overrides: dict[str, Any],
+    epochs: int,
+) -> list[dict[str, Any]]:
+    """CPU ms per 1,000 control steps of both backends by part, a row each."""
+    module = importlib.import_module(f"safemr.algorithms.{algorithm}")
+
+    def met(num_envs: int) -> Any:
+        envs = make_envs(task, num_envs)
+        return interface.fitted(envs).around(envs)
+
+    runs = []
+    for backend in BACKENDS:
+        config = module.Config(backend=backend, **overrides)
+        trainer, stopwatch = module.Trainer(config, met, 100, 10**9), Stopwatch()
+        trainer.advance(1)
+        stopwatch.watch(trainer)
+        runs.append((trainer, stopwatch, []))
+    for _ in range(epochs):
+        for trainer, stopwatch, samples in runs:
+            stopwatch.reset()
+            begun = trainer.step
+            trainer.advance(begun + 1)
+            stopwatch.lap()
+            scale = 1e6 / (trainer.step - begun)
+            samples.append({part: scale * spent for part, spent in stopwatch.spent.items()})
+    rows = []
+    for trainer, _, samples in runs:
+        parts = {
+            part: round(statistics.median(sample[part] for sample in samples), 1)
+            for part in samples[0]
+        }
+        total = round(statistics.median(sum(sample.values()) for sample in samples), 1)
+        case = {"algorithm": algorithm, "task": task, "backend": trainer.config.backend}
+        rows.append({**case, "total": total, **parts})
+    rows[1]["ratio"] = round(rows[0]["total"] / rows[1]["total"], 2)
+    return rows
+
+
+def compared(epochs: int) -> list[dict[str, Any]]:
+    """Both backends in all cases."""
+    rows = []
+    for task, interface, shared, ppo in COMPARED:
+        for algorithm in ALGORITHMS:
+            overrides = {**shared, **(ppo if algorithm == "ppo_lagrangian" else {})}
+            rows += compare(algorithm, task, interface, overrides, epochs)
+            for row in rows[-2:]:
+                print("  ".join(f"{name}={value}" for name, value in row.items()), flush=True)
+    return rows
+
+
+def grids(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Each algorithm with the settings that are named above."""
     cases = [("ppo_lagrangian", "omnisafe", OMNISAFE)]
     for algorithm in ALGORITHMS:
         published = importlib.import_module(f"safemr.algorithms.{algorithm}").PUBLISHED
@@ -102,9 +165,21 @@ def main() -> None:
     for case in cases:
         rows.append(measure(*case, arguments.task, arguments.epochs))
         print("  ".join(f"{name}={value}" for name, value in rows[-1].items()), flush=True)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--task", default="Pillars-0.15-Goal")
+    parser.add_argument("--epochs", type=int, default=3)
+    parser.add_argument("--backends", action="store_true", help="compare the two backends")
+    parser.add_argument("--output", help="also write the table to this CSV file")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    rows = compared(arguments.epochs) if arguments.backends else grids(arguments)
     if arguments.output:
         with open(arguments.output, "w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]))
+            writer = csv.DictWriter(stream, list(rows[-1]))
             writer.writeheader()
             writer.writerows(rows)
 

@@ -72,6 +72,11 @@ class _TaskAttributes:
         return self.task.observation_layout
 
     @property
+    def decodable_lidars(self) -> tuple[str, ...]:
+        """Lidars that say exactly where the one object is that they see."""
+        return self.task.decodable_lidars
+
+    @property
     def setting_names(self) -> list[str]:
         """The keyword arguments that change the task."""
         return self.task.setting_names

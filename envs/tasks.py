@@ -90,6 +90,14 @@ class NavigationTask:
         return 3.0 if self.family == "hazards_goal" else math.inf
 
     @property
+    def decodable_lidars(self) -> tuple[str, ...]:
+        """Lidars whose readings hold the exact bearing and distance of the one object they see."""
+        if self.lidar_range < math.inf:  # the linear one sees nothing beyond its range
+            return ()
+        single = {"goal", "box", *(("pillars", "hazards") if self.num_obstacles == 1 else ())}
+        return tuple(f"{name}_lidar" for name in LIDARS[self.family] if name in single)
+
+    @property
     def d_min(self) -> float:
         """Distance robot centre to obstacle centre at which a violation begins.
 

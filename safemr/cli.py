@@ -3,7 +3,10 @@
 safemr train ...      train one run
 safemr evaluate ...   evaluate a recorded policy
 safemr certify ...    check a learned energy function
+safemr play RECORD .. draw an episode of a policy, with phi and the filter's interventions
 safemr records ...    verify the records under a results root and say what is unfinished
+safemr check-algorithm NAME  check that an algorithm keeps to the contract of a trainer
+safemr check ID ...   what an environment from outside has and lacks (docs/your-own.md)
 safemr list ...       tasks, algorithms and hyperparameters (`safemr list ALGORITHM`)
 safemr config ...     check configuration files, each put over the ones before it
 safemr documents ...  put the tables that the pipeline made into documents
@@ -26,7 +29,10 @@ COMMANDS = {
     "train": "safemr.experiment.train",
     "evaluate": "safemr.measure.evaluate",
     "certify": "safemr.report.certificates",
+    "play": "safemr.report.play",
     "records": "safemr.experiment.overview",
+    "check-algorithm": "safemr.experiment.check_algorithm",
+    "check": "safemr.experiment.check",
     "list": "safemr.experiment.listing",
     "config": "safemr.experiment.config",
     "documents": "safemr.report.documents",

@@ -12,3 +12,19 @@ COVERS = 0.01
 # First layout of the evaluations during a run, and of those layouts that no run was evaluated on.
 EVALUATION_SEED = 10_000
 UNSEEN_SEED = 20_000
+
+# Runs with seeds from here on are for tuning, those below are reported. What is tuned is looked at
+# on layouts of its own, so that the reported ones have decided nothing.
+FIRST_TUNING_SEED = 100
+TUNING_EVALUATION_SEED = 30_000
+TUNING_UNSEEN_SEED = 40_000
+
+
+def evaluation_seed(seed: int) -> int:
+    """The first layout of the evaluations during a run with this seed."""
+    return EVALUATION_SEED if seed < FIRST_TUNING_SEED else TUNING_EVALUATION_SEED
+
+
+def unseen_seed(seed: int) -> int:
+    """The first of the layouts on which no run with this seed was evaluated while it trained."""
+    return UNSEEN_SEED if seed < FIRST_TUNING_SEED else TUNING_UNSEEN_SEED

@@ -38,7 +38,12 @@ OPTIONAL_INFOS = {
     "reward_approach": "0",
     "reward_push": "0",
     "reward_goal": "0",
+    "control_steps": "1",
 }
+
+
+# A bound beyond it is none: some spaces write the largest number of their type for infinity.
+LARGEST_BOUND = 1e6
 
 
 class SafetyEnvs(Protocol):
@@ -74,7 +79,7 @@ class SafetyEnvs(Protocol):
 
     @property
     def observation_layout(self) -> Mapping[str, slice]:
-        """Sensor -> its columns of an observation."""
+        """Sensor -> its columns of an observation; empty where nothing but the space is known."""
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Any = None
@@ -89,8 +94,12 @@ class SafetyEnvs(Protocol):
     def get_state(self) -> dict[str, Any]:
         """A complete snapshot, which shares no memory with the environments."""
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a snapshot; the environments then continue bit for bit."""
+    def set_state(self, state: Mapping[str, Any]) -> tuple[Observations, Infos] | None:
+        """Restore a snapshot; the environments then continue bit for bit.
+
+        Those that cannot say ``exact_resume = False``: they begin new episodes, and what `reset`
+        gives of them is returned.
+        """
 
 
 def info_of(infos: Mapping[str, Any], name: str) -> Any:
@@ -99,7 +108,22 @@ def info_of(infos: Mapping[str, Any], name: str) -> Any:
         return infos[name]
     if name == "cost_contact":
         return info_of(infos, "cost_indicator")
-    return infos["cost"] > 0.0 if name == "cost_indicator" else 0.0
+    if name == "cost_indicator":
+        return infos["cost"] > 0.0
+    return 1.0 if name == "control_steps" else 0.0
+
+
+def bounded(space: Any) -> NDArray[np.bool_]:
+    """Which entries of a Box have bounds that say something of their scale."""
+    import numpy as np
+
+    finite = (np.abs(space.low) <= LARGEST_BOUND) & (np.abs(space.high) <= LARGEST_BOUND)
+    return finite & (space.low < space.high)
+
+
+def exact_resume(envs: Any) -> bool:
+    """Whether a snapshot of the environments continues bit for bit, as it does unless they say."""
+    return bool(getattr(envs, "exact_resume", True))
 
 
 def check_envs(envs: Any) -> None:
@@ -162,7 +186,7 @@ def check_envs(envs: Any) -> None:
         for part in layout.values()
     )
     require(
-        inside and layout,
+        inside,
         f"observation_layout is {_seen(envs, 'observation_layout')}",
         f"it maps each sensor to its slice of the {width} columns",
     )
@@ -202,6 +226,8 @@ def check_envs(envs: Any) -> None:
         array(value, f"step: {name}", (n,), "b")
     infos_of(result[4], REQUIRED_INFOS, "step")
     require((np.asarray(result[4]["cost"]) >= 0).all(), "cost is negative", "0 is no cost")
+    if not exact_resume(envs):
+        return
     reached = np.array(result[0])
     envs.set_state(saved)
     require(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sample_record import CONFIG, ROWS
 
-from safemr import paper
+from safemr import files, paper
 from safemr.certificates import falsification
 from safemr.certificates.certificate import EnergyCertificate
-from safemr.certificates.energy import energy
+from safemr.certificates.energy import constraint, energy, largest
 from safemr.certificates.falsification import ROBOT
 from safemr.certificates.feasibility import analytic_condition, radial_requirement
 from safemr.certificates.point_robot import PointRobot
@@ -107,14 +108,34 @@ def test_constants_are_those_of_the_specification():
     assert robot.deceleration(np.array([0.0]), "aligned brake")[0] == pytest.approx(2.89, abs=0.005)
 
 
+def simulated_grid(simulator, states, zeta, action_repeat):
+    """g [S, A] of the grid, held for so many steps."""
+    worlds = falsification.worlds_near_obstacle(simulator, states)
+    phi = falsification.energies(states, float(simulator.d_min), zeta)
+    return falsification.simulated_grid(
+        simulator, worlds, states[:, 4], phi, zeta, 0.0, action_repeat
+    )[1]
+
+
 def test_model_equals_the_simulator_away_from_contact(simulator):
     states, zeta = random_states(24), LEARNED[0]
-    d_min = float(simulator.d_min)
-    modelled = falsification.grid_margins(states, d_min, zeta, 0.0)
-    worlds = falsification.worlds_near_obstacle(simulator, states)
-    phi = falsification.energies(states, d_min, zeta)
-    _, simulated = falsification.simulated_grid(simulator, worlds, states[:, 4], phi, zeta, 0.0)
-    np.testing.assert_allclose(modelled, simulated, atol=1e-9)
+    modelled = falsification.grid_margins(states, float(simulator.d_min), zeta, 0.0)
+    np.testing.assert_allclose(modelled, simulated_grid(simulator, states, zeta, 1), atol=1e-9)
+
+
+def test_model_equals_the_simulator_over_held_actions(simulator):
+    """To 1e-9 wherever the servo does not amplify a nudge; the least of the grid everywhere."""
+    states, zeta = random_states(24), LEARNED[0]
+    nudged = states + 1e-12 * np.random.default_rng(1).normal(size=states.shape)
+    modelled, again = (
+        falsification.grid_margins(x, float(simulator.d_min), zeta, 0.0, 5)
+        for x in (states, nudged)
+    )
+    simulated = simulated_grid(simulator, states, zeta, 5)
+    steady = np.abs(modelled - again) < 1e-10
+    assert steady.mean() > 0.5
+    np.testing.assert_allclose(modelled[steady], simulated[steady], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(modelled.min(1), simulated.min(1), rtol=0, atol=1e-4)
 
 
 def test_placed_worlds_have_the_distance_and_rate_that_were_asked_for(simulator):
@@ -141,6 +162,42 @@ def test_action_grid_resolves_thrust_and_servo():
     assert np.diff(near).max() <= 0.0151
 
 
+def test_the_grid_stays_within_what_a_learner_can_do():
+    rates = np.array([-1.0, 2.0])
+    whole = falsification.action_grid(rates)
+    np.testing.assert_array_equal(falsification.action_grid(rates, (0.05, 1.0)), whole)
+    np.testing.assert_array_equal(
+        falsification.action_grid(rates, (0.02, 0.5)), np.clip(whole, [-0.02, -0.5], [0.02, 0.5])
+    )
+
+
+def test_a_state_may_have_a_safe_action_for_one_step_and_none_for_five(pillars):
+    """Sideways and near top speed, a thrust across the way helps for one step alone."""
+    state = np.array([[1.2743, 1.7460, 0.1955, 1.4605, 0.5931]])
+    for repeat, margin in ((1, -0.0388), (5, 0.0042)):
+        modelled = falsification.grid_margins(state, D_MIN, paper.PHI_H, 0.0, repeat).min()
+        assert modelled == pytest.approx(margin, abs=5e-4)
+        simulated = falsification.simulated_margins(pillars, state, paper.PHI_H, 0.0, repeat)
+        assert simulated == pytest.approx(modelled, abs=1e-4)
+
+
+def test_an_action_is_held_within_one_episode(pillars):
+    states = random_states(8)
+    actions = np.full((8, 2), 0.03)
+
+    def after(envs, repeat):
+        worlds = falsification.worlds_near_obstacle(envs, states)
+        return falsification.next_energies(envs, worlds, actions, paper.PHI_H, repeat)
+
+    short = falsification.make_simulator(
+        {"name": "Short", "base": TASK, "settings": {"max_episode_steps": 5}}, 8
+    )
+    np.testing.assert_array_equal(after(short, 5), after(pillars, 5))
+    with pytest.raises(UserError, match="held for 6 control steps in episodes of 5"):
+        after(short, 6)
+    short.close()
+
+
 # --- (b) falsification ---------------------------------------------------------------------------
 
 
@@ -155,6 +212,21 @@ def test_search_is_seeded_and_its_example_replays(pillars):
     actions, g = falsification.replay(example)
     assert g.min() == pytest.approx(first.worst_margin, abs=1e-12)
     assert actions.shape == (len(g), 2)
+
+
+def test_an_example_of_held_actions_says_so_and_replays(pillars):
+    def example(**held):
+        search = falsification.falsify(pillars, TASK, LEARNED[1], count=256, rounds=2, **held)
+        return json.loads(json.dumps(search.example()))
+
+    assert not {"action_repeat", "action_scale"} & example().keys()
+    found = example(action_repeat=5, action_scale=(0.02, 1.0))
+    assert (found["action_repeat"], found["action_scale"]) == (5, [0.02, 1.0])
+    actions, g = falsification.replay(found)
+    assert g.min() == pytest.approx(found["margin"], abs=1e-12)
+    assert np.abs(actions[:, 0]).max() == 0.02
+    del found["action_repeat"]
+    assert abs(falsification.replay(found)[1].min() - found["margin"]) > 1e-3
 
 
 def test_refinement_finds_that_no_learned_set_is_feasible_everywhere(pillars):
@@ -207,7 +279,7 @@ class Constant:
 def test_a_resting_robot_never_violates_and_a_rammer_could_have_done_otherwise():
     task = TASK
     resting = check_policy(Constant(0, 0), task, LEARNED[0], num_envs=4, steps=20)
-    assert resting.steps == 80
+    assert resting.decisions == 80
     assert resting.violating == 0
     assert resting.avoidable_share == 0.0
     ramming = check_policy(Constant(1, 0), task, LEARNED[0], num_envs=16, steps=120, limit=20)
@@ -215,6 +287,25 @@ def test_a_resting_robot_never_violates_and_a_rammer_could_have_done_otherwise()
     assert ramming.examined == min(20, ramming.violating)
     assert ramming.avoidable >= 0.8 * ramming.examined
     assert ramming.avoidable_share <= ramming.violating_share
+
+
+def test_the_constraint_of_a_policy_is_between_states_a_decision_apart():
+    """Of 4, 4, and in each episode at last 2 steps, which are no whole decision, by hand."""
+    task = {"name": "Short", "base": TASK, "settings": {"max_episode_steps": 50}}
+    ramming = Constant(1, 0)
+    ramming.action_repeat = 4
+    check = check_policy(ramming, task, LEARNED[0], num_envs=16, steps=50, seed=3, limit=4)
+    envs = falsification.make_simulator(task, 16)
+    _, infos = envs.reset(seed=3)
+    phi = []
+    for _ in range(49):
+        phi.append(largest(energy(infos["d"], infos["d_dot"], D_MIN, *LEARNED[0])))
+        infos = envs.step(np.tile(ramming.action, (16, 1)))[-1]
+    envs.close()
+    apart = np.array(phi)[::4]
+    assert check.decisions == 12 * 16
+    assert check.violating == (constraint(apart[:-1], apart[1:], 0.0) >= 0).sum() > 4
+    assert check.examined == 4
 
 
 # --- the command ---------------------------------------------------------------------------------
@@ -264,10 +355,17 @@ LARGE = {"name": "Large", "version": 1, "settings": {"obstacle_size": 0.3}, "bas
 ZETA = ["--sigma", "0.2", "--k", "0.8", "--n", "2.1", "--name", "mine", "--states", "256"]
 
 
-def record_on(root: Path, task: dict[str, Any], algorithm: str = "fac", **arrays: Any) -> Path:
+def record_on(
+    root: Path,
+    task: dict[str, Any],
+    algorithm: str = "fac",
+    interface: dict[str, Any] | None = None,
+    **arrays: Any,
+) -> Path:
     """A record that logs a zeta."""
     described = {"name": algorithm, "version": 1, "hyperparameters": {"gamma": 0.99}}
     config = {**CONFIG, "task": task, "algorithm": described}
+    config |= {"interface": interface} if interface else {}
     rows = [{**row, "sigma": 0.2, "k": 0.8, "n": 2.1} for row in ROWS]
     folder = root / records.record_path(config, "FAC-phih")
     records.write_record(folder, config, "FAC-phih", rows, {}, arrays or None)
@@ -287,9 +385,8 @@ def test_the_search_covers_the_distances_of_the_settings():
     expected = analytic_condition(certificate.zeta, 0.4)["margin"].tolist()
     found = [value for name, value in row.items() if name.startswith("margin_")]
     assert found == expected
-    assert certify.margin_map(LARGE, certificate.zeta, distances=3, bearings=3)[
-        "distance"
-    ].min() == pytest.approx(0.4)
+    margins = certify.margin_map(certificate, LARGE, distances=3, bearings=3)
+    assert margins["distance"].min() == pytest.approx(0.4)
 
 
 def test_the_command_line_and_a_record_certify_the_same_task(tmp_path, capsys):
@@ -359,6 +456,43 @@ def test_kept_measurements_of_other_settings_are_others(tmp_path):
     assert [example.get("settings") for _, example in rows] == [
         None, {"obstacle_size": 0.3}, {"obstacle_size": 0.4}
     ]  # fmt: skip
+
+
+def test_a_record_is_checked_over_its_own_decisions(tmp_path, capsys, monkeypatch):
+    """A hold of its configuration reaches search, table, example, map and what is kept."""
+    plain, interface = {"name": TASK, "version": 1, "settings": {}}, {"action_repeat": 5}
+    folders = [
+        record_on(tmp_path, plain, interface=entry)
+        for entry in (None, interface, interface | {"action_scale": [0.05, 1.0], "decode": []})
+    ]
+    jobs = [certify.certificate_of_record(folder)[0] for folder in folders]
+    kept = Measurements(tmp_path)
+    for module, name, less in (
+        (certify, "margin_map", {"distances": 9, "bearings": 9}),
+        (falsification, "falsify", {"rounds": 1}),
+    ):
+        monkeypatch.setattr(module, name, functools.partial(getattr(module, name), **less))
+    rows, examples = zip(
+        *(certify.measured_certificate(kept, job, plain, states=64, episodes=1) for job in jobs),
+        strict=True,
+    )
+    assert [row.get("action_repeat") for row in rows] == [None, 5, 5]
+    assert [example.get("action_repeat") for example in examples] == [None, 5, 5]
+    assert [example.get("action_scale") for example in examples] == [None, None, [0.05, 1.0]]
+    assert rows[0]["worst_margin"] < rows[1]["worst_margin"] == rows[2]["worst_margin"]
+    maps = [certify.measured_margins(kept, job, plain)[0] for job in jobs[:2]]
+    assert maps[1]["margin"].max() > maps[0]["margin"].max() > 0
+    paths = sorted((tmp_path / "measurements/margins").iterdir())
+    headers = [json.loads(str(files.load_arrays(path)["measurement"])) for path in paths]
+    assert [header["inputs"]["interface"] for header in headers
+            if "interface" in header["inputs"]] == [interface]  # fmt: skip
+    arguments = [text for folder in folders[:2] for text in ("--record", str(folder))]
+    assert certificates.main([*arguments, "--states", "64"]) == 0
+    assert "control steps a decision" in capsys.readouterr().out
+    file = tmp_path / "examples.json"
+    file.write_text(json.dumps({"one step": examples[0], "five": examples[1]}))
+    assert certificates.main(["--replay", str(file)]) == 0
+    assert capsys.readouterr().out.count("100 actions held for 5 control steps, ") == 1
 
 
 def test_equal_titles_are_numbered_so_that_no_example_is_lost():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import datetime
+import importlib
 import math
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safemr.errors import UserError
-from safemr.experiment import config, planning
+from safemr.experiment import config, planning, train
 from safemr.experiment.plan_cache import plan_for
 from safemr.experiment.strict_yaml import StrictLoader
 
@@ -56,6 +57,12 @@ VALID: dict[str, Any] = {
     "figures_root": "paper_figures",
     "wandb": {"mode": "disabled", "project": "safemr"},
     "safe": {"cost_tolerance": 1.0, "zero_violation_share": 0.95},
+    "filters": {
+        "policies": ["PPO-L"],
+        "certificates": ["phi_h", "SafeMR"],
+        "episodes": 3,
+        "seed": 40000,
+    },
 }
 
 NOT_A_NUMBER = ["1", "1e5", None, [], {}, True, datetime.date(2020, 1, 1)]
@@ -153,9 +160,30 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
     ("evaluation", "points"): NOT_POSITIVE,
     ("evaluation", "episodes"): NOT_POSITIVE,
     ("evaluation", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("interface",): [
+        *(*NOT_A_MAPPING, 0, [], False, {"action_repat": 5}, {3: 1}),
+        *({"action_repeat": value} for value in [*NOT_AN_INTEGER, 0, -1, 1_001, 10**30]),
+        *({"action_scale": value} for value in [None, 1.0, "0.05", True, {}, [1.0], [0.1] * 3]),
+        *({"action_scale": [0.5, value]} for value in [*NOT_A_NUMBER, 0, -0.1, 1.5, math.nan]),
+        *({"action_scale": [value, 0.5]} for value in [math.inf, 10**400]),
+        *({"decode": value} for value in [None, 3, True, "goal_lidar", "Single", [3], {"a": 1}]),
+        *({"decode": [name]} for name in ["pillars_lidar", "goal_ldar", "gyro", "box_lidar", ""]),
+        {"decode": ["goal_lidar", "goal_lidar"]},
+    ],
+    ("task_overrides", "Hazards-0.15-Push", "interface"): [
+        *(*NOT_A_MAPPING, {"repeat": 5}, {"action_repeat": 0}, {"action_scale": [0.05]}),
+        *({"decode": ["pillars_lidar"]}, {"decode": ["vases_lidar"]}),
+    ],
     ("unseen_layouts",): [*NOT_A_MAPPING, {"seed": 1}, {"episode": 5}],
     ("unseen_layouts", "episodes"): NOT_POSITIVE,
     ("unseen_layouts", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("filters",): [*NOT_A_MAPPING, {"policies": ["PPO-L"]}, {"policy": ["PPO-L"]}],
+    ("filters", "policies"): [*NOT_A_LIST, ["PPO"], ["PPO-L", "PPO-L"]],
+    ("filters", "certificates"): [*NOT_A_LIST, ["phi_1"], ["phi_h", "phi_h"]],
+    ("filters", "episodes"): NOT_POSITIVE,
+    ("filters", "seed"): [*NOT_AN_INTEGER, -1, 2**31],
+    ("filters", "tasks"): [*NOT_A_LIST, ["Pillars-0.30-Goal"]],
+    ("filters", "seeds"): [*NOT_A_LIST, [0], [100, 100]],
     ("task_overrides",): [
         *NOT_A_MAPPING,
         *({name: {}} for name in ["Pillar-0.15-Goal", *NOT_A_NAME[2:]]),
@@ -316,6 +344,12 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
         (("sensitivity", "algorithm"), "SafeMT", "did you mean 'SafeMR'?"),
         (("wandb", "mode"), "ofline", "did you mean 'offline'?"),
         (("task_overrides", "Hazards-0.15-Push", "settings"), {"slep": True}, "'slep'"),
+        (("interface",), {"action_repat": 5}, "in interface; did you mean 'action_repeat'?"),
+        (
+            ("task_overrides", "Hazards-0.15-Push", "interface"),
+            {"scale": [0.05, 1.0]},
+            "in task_overrides.Hazards-0.15-Push.interface; did you mean 'action_scale'?",
+        ),
     ],
 )
 def test_misspelt_names_are_named_with_the_nearest(
@@ -438,7 +472,11 @@ CHANGES: list[tuple[tuple[str, ...], Any, int]] = [
     (("sensitivity", "points"), [[0.45, 0.15], [0.5, 0.5]], 1),
     (("outside", "Script", "version"), 2, 4),
     (("evaluation", "episodes"), 3, 14),
+    (("interface",), {"action_repeat": 2}, 13),  # all but the aircraft's
+    (("task_overrides", "Hazards-0.15-Push", "interface"), {"action_repeat": 2}, 4 + 2),
+    (("interface",), {"action_repeat": 1}, 0),
     (("unseen_layouts", "episodes"), 50, 0),
+    (("filters", "episodes"), 50, 0),
     (("wandb", "mode"), "offline", 0),
     (("safe", "cost_tolerance"), 2.0, 0),
     (("figures_root",), "elsewhere", 0),
@@ -455,6 +493,109 @@ def test_a_change_makes_exactly_the_runs_it_touches_new(
     assert len(after - before) == count
 
 
+PUSH = "Hazards-0.15-Push"
+HELD = {"action_repeat": 5, "action_scale": [0.05, 1], "decode": "single"}
+
+
+def met(raw: Any) -> dict[str, Any]:
+    """Task -> the interface of its runs, None where their configs have none."""
+    found: dict[str, list[Any]] = {}
+    for run in resolve(raw).runs:
+        found.setdefault(run.task, []).append(run.config.get("interface"))
+    assert all(entry == entries[0] for entries in found.values() for entry in entries)
+    return {task: entries[0] for task, entries in found.items()}
+
+
+def test_an_interface_is_that_of_every_run_of_the_tasks_with_its_lidars_named() -> None:
+    entry = {"action_repeat": 5, "action_scale": [0.05, 1.0]}
+    assert met(changed(("interface",), HELD)) == {
+        "Pillars-0.15-Goal": {**entry, "decode": ["goal_lidar"]},  # of four pillars no bearing
+        PUSH: {**entry, "decode": ["box_lidar", "goal_lidar", "hazards_lidar"]},
+        "Aircraft": None,
+    }
+    # The task of the sensitivity study is met like `tasks`, though it be none of them.
+    elsewhere = changed(("sensitivity", "task"), "Pillars-0.30-Goal")
+    elsewhere["interface"] = {"action_repeat": 2}
+    assert met(elsewhere)["Pillars-0.30-Goal"] == {"action_repeat": 2}
+
+
+def test_a_tasks_own_interface_replaces_the_common_one_wholly() -> None:
+    raw = changed(("task_overrides", PUSH, "interface"), {"action_repeat": 2})
+    raw["task_overrides"]["Aircraft"] = {"interface": {"action_scale": [0.5]}}
+    assert met(raw) == {
+        "Pillars-0.15-Goal": None,
+        PUSH: {"action_repeat": 2},
+        "Aircraft": {"action_scale": [0.5]},
+    }
+    raw["interface"] = HELD
+    assert met(raw)[PUSH] == {"action_repeat": 2}
+    for nothing in (None, {}, {"action_repeat": 1, "action_scale": [], "decode": []}):
+        raw["task_overrides"][PUSH]["interface"] = nothing
+        assert met(raw)[PUSH] is None
+    del raw["task_overrides"][PUSH]["interface"]
+    assert met(raw)[PUSH] is not None
+
+
+def test_an_interface_that_changes_nothing_leaves_digests_as_they_are() -> None:
+    before = {run.path for run in resolve(VALID).runs}
+    default = {"action_repeat": 1, "action_scale": [], "decode": []}
+    for nothing in (None, {}, default):
+        assert {run.path for run in resolve(changed(("interface",), nothing)).runs} == before
+    spelled = changed(("interface",), {**HELD, "action_scale": [0.05, 1.0]})
+    paths = {run.path for run in resolve(changed(("interface",), HELD)).runs}
+    assert paths == {run.path for run in resolve(spelled).runs}
+    aircraft = {path for path in before if "Aircraft" in path.parts}
+    assert paths & before == aircraft
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"action_repat": 5}, "did you mean 'action_repeat'?"),
+        ({"action_repeat": 0}, "interface.action_repeat must be an integer of at least 1, not 0"),
+        ({"action_repeat": 2.5}, "interface.action_repeat must be an integer"),
+        ({"action_repeat": True}, "interface.action_repeat must be an integer"),
+        ({"action_repeat": 1001}, "must not exceed the 1000 steps of an episode"),
+        ({"action_scale": [0.05]}, "interface.action_scale must have 2 numbers"),
+        ({"action_scale": [0, 1]}, "interface.action_scale must be numbers in (0, 1], not [0, 1]"),
+        ({"action_scale": [-0.1, 1]}, "interface.action_scale must be numbers in (0, 1]"),
+        ({"action_scale": "small"}, "one number in (0, 1] for each component of an action"),
+        ({"decode": ["pillars_lidar"]}, "task Pillars-0.15-Goal: interface.decode: pillars_lidar"),
+        ({"decode": ["goal_ldar"]}, "those are goal_lidar"),
+        ({"decode": "all"}, "must be a list of lidars or 'single', not 'all'"),
+    ],
+)
+def test_what_is_wrong_with_an_interface_is_said_with_the_remedy(
+    entry: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = {**VALID, "task_overrides": {}, "interface": entry}
+    with pytest.raises(UserError) as caught:
+        resolve(raw)
+    assert said in one_line(caught.value)
+    ((name, value),) = entry.items()
+    command = ["--task", "Pillars-0.15-Goal", "--algorithm", "fac", "--set"]
+    assert train.main([*command, f"interface.{name}={value}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said.replace("interface.", "--set interface.") in line
+
+
+def test_an_interface_of_a_task_without_runs_is_checked_too() -> None:
+    raw = changed(("task_overrides", "Hazards-0.30-Push"), {"interface": {"action_scale": [1.0]}})
+    with pytest.raises(UserError, match=r"task Hazards-0\.30-Push: task_overrides"):
+        resolve(raw)
+
+
+def test_the_command_line_sets_an_interface_like_a_configuration() -> None:
+    settings = [f"interface.{name}={value}" for name, value in HELD.items()]
+    command = ["--task", PUSH, "--algorithm", "fac", "--steps", "10000"]
+    for setting in settings:
+        command += ["--set", setting]
+    run, _ = train.resolve(train._parse(command))
+    assert run["interface"] == met(changed(("interface",), HELD))[PUSH]
+    run, _ = train.resolve(train._parse([*command[:6], "--set", "interface.action_repeat=1"]))
+    assert "interface" not in run
+
+
 def test_equal_settings_have_equal_digests() -> None:
     spelled_out = changed(("algorithms", "SafeMR", "a"), 0.35)
     spelled_out["algorithms"]["SafeMR"]["gamma"] = 0.99  # the default
@@ -464,7 +605,7 @@ def test_equal_settings_have_equal_digests() -> None:
 
 def test_version_bumps_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
     before = {run.path for run in resolve(VALID).runs}
-    module = planning.importlib.import_module("safemr.algorithms.ppo_lagrangian")
+    module = importlib.import_module("safemr.algorithms.ppo_lagrangian")
     monkeypatch.setattr(module, "VERSION", module.VERSION + 1)
     planning.load_algorithm.cache_clear()
     after = {run.path for run in resolve(VALID).runs}
@@ -518,6 +659,9 @@ def test_plans_are_remembered_until_something_changes(
     assert len(calls) == 1
     plan_for(config.parse(changed(("seeds",), [5])))
     assert len(calls) == 2
+    held = config.parse(changed(("interface",), HELD))
+    assert plan_for(held) == plan_for(held) == real(held)
+    assert len(calls) == 3
     (tmp_path / "results/.work/plan.json").write_text("{")
     assert plan_for(config.parse(VALID)) == first
-    assert len(calls) == 3
+    assert len(calls) == 4

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from safemr.experiment import planning, records
+from safemr.experiment import config, planning, records
 from safemr.experiment.forecast import announced
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,6 +63,32 @@ def test_a_new_baseline_is_estimated_by_its_own_family(tmp_path: Path) -> None:
     ):
         (first, _) = announced(tmp_path, [*recorded, run(name, steps=steps)])
         assert first == f"To be trained: 1 run, about {expected} by the records here"
+
+
+def test_a_run_whose_actions_are_held_is_not_estimated_by_records_of_another_hold(
+    tmp_path: Path,
+) -> None:
+    """A control step of such a run costs a part of one with a decision of its own."""
+
+    def planned(**interface: int) -> list[planning.Run]:
+        raw = {
+            "tasks": ["Pillars-0.15-Goal"],
+            "algorithms": {"FAC": {"algorithm": "fac", "start_steps": 100}},
+            "seeds": [0, 1],
+            "budget": {"off_policy": 6000},
+            "log_points": 10,
+            "evaluation": {"points": 5, "episodes": 1},
+            "interface": interface,
+        }
+        return list(planning.resolve(config.parse(raw)).runs)
+
+    (every, _), held = planned(), planned(action_repeat=5)
+    record(tmp_path, every, 600.0)
+    (first, _) = announced(tmp_path, held)
+    assert first == "To be trained: 2 runs, for how long no record tells"
+    record(tmp_path, held[0], 120.0)
+    (first, _) = announced(tmp_path, held)
+    assert first == "To be trained: 1 run, about 2 core-minutes by the records here"
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import subprocess
 import sys
 import typing
@@ -18,6 +19,7 @@ from safemr.errors import UserError
 from safemr.experiment import catalogue, listing, planning, train
 from safemr.learning import hyperparameters
 
+ROOT = Path(__file__).resolve().parents[1]
 STEPS = 800
 SMALL: dict[str, dict[str, Any]] = {
     "off_policy": {
@@ -44,11 +46,15 @@ BESIDE: dict[str, dict[str, Any]] = {
     "backtrack_iterations": {"target_kl": 1.0},
     "target_kl": {"policy_lr": 0.01},  # PPO has to reach the bound
     "kl_stop": {"policy_lr": 0.01},
+    **{f"explore_{what}": {"explore_share": 0.5} for what in ("hold_min", "hold_max", "until")},
     "certificate_derivative": {"sigma": 0.9, "a": 0.1},  # the point has to enter the unsafe set
 }
 # No loss can raise sigma, and k and n move little: these bounds of the box refuse a start beyond.
 BOUNDS_OF_THE_START = {"sigma_max": 0.2, "k_max": 0.2, "n_min": 3.0, "n_max": 0.2}
-ELSEWHERE = ("device",)  # says where the numbers are made, not which
+ELSEWHERE = (
+    "device",  # says where the numbers are made, not which
+    *("family", "start", "family_version"),  # tests/test_your_certificate.py has another family
+)
 
 
 def small(algorithm: catalogue.Algorithm) -> dict[str, Any]:
@@ -130,6 +136,58 @@ def test_what_is_declared_unused_is_so_and_cannot_be_set(name: str) -> None:
             algorithm.hyperparameters(**{field: -0.7})
         # It stays in the resolved settings: digests of records do not move.
         assert catalogue.hyperparameters(algorithm, {}, "test")[field] == default
+
+
+# Fields that came after runs had been recorded, with the default that those runs had.
+ADDED = {
+    "off_policy": {
+        "explore_share": 0.0,
+        "explore_hold_min": 3,
+        "explore_hold_max": 15,
+        "explore_until": 0.8,
+    },
+    "on_policy": {"backend": "torch"},
+}
+OF_ENERGIES = {"record_critic": False}  # where phi is what the constraint critic learns
+OF_FAMILIES = {"family": "paper", "start": (), "family_version": 0}
+
+
+@pytest.mark.parametrize("name", planning.algorithm_names())
+def test_what_came_later_is_resolved_only_where_it_is_set(name: str) -> None:
+    algorithm = planning.load_algorithm(name)
+    config, added = algorithm.hyperparameters(), ADDED[algorithm.family]
+    added = {**added, **({**OF_ENERGIES, **OF_FAMILIES} if algorithm.certificate else {})}
+    assert {field: getattr(config, field) for field in added} == added
+    plain = catalogue.hyperparameters(algorithm, {}, "test")
+    assert plain == {k: v for k, v in dataclasses.asdict(config).items() if k not in added}
+    assert catalogue.hyperparameters(algorithm, added, "test") == plain
+    for field, default in added.items():
+        if field in OF_FAMILIES:  # tests/test_your_certificate.py
+            continue
+        if isinstance(default, str):
+            other: Any = {"backend": "fused"}[field]
+        elif isinstance(default, bool):
+            other = not default
+        else:
+            other = default / 2 if isinstance(default, float) and default else default + 1
+        changed = catalogue.hyperparameters(algorithm, {field: other}, "test")
+        assert changed == {**plain, field: other}
+
+
+def test_settings_of_the_records_are_what_is_resolved_today() -> None:
+    """As many keys and the same values: the same digests, so nothing is trained anew."""
+    seen = set()
+    for path in ROOT.glob("results/**/config.json"):
+        recorded = json.loads(path.read_text())["algorithm"]
+        if recorded["name"] in planning.algorithm_names():
+            algorithm = planning.load_algorithm(recorded["name"])
+            values = recorded["hyperparameters"]
+            if recorded["version"] == algorithm.version:
+                again = {k: v for k, v in values.items() if k in algorithm.settable}
+                assert catalogue.hyperparameters(algorithm, again, path.as_posix()) == values
+                seen.add(algorithm.name)
+    assert seen >= {"safemr", "joint_sis", "fac", "neural_safemr"}
+    assert seen >= {"ppo_lagrangian", "trpo_lagrangian", "cpo"}
 
 
 @pytest.mark.parametrize("name", ["joint_sis", "safemr"])
@@ -244,9 +302,8 @@ def test_the_help_of_safemr_imports_nothing_heavy() -> None:
         "import sys; from safemr import cli; cli.main(['--help']); "
         "print([m for m in ('torch', 'mujoco', 'gymnasium', 'numpy') if m in sys.modules])"
     )
-    root = Path(__file__).resolve().parents[1]
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=True
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
     )
     assert "safemr list" in done.stdout
     assert done.stdout.splitlines()[-1] == "[]"

@@ -118,3 +118,14 @@ def test_squashed_gaussian_integrates_to_one():
     action, log_density = squashed_gaussian(output, noise)
     mass = torch.trapezoid(log_density.exp(), action[:, 0])
     torch.testing.assert_close(mass, torch.ones_like(mass), atol=1e-4, rtol=0)
+
+
+def test_a_member_of_a_stack_is_that_network() -> None:
+    stack = StackedMLP(3, (4, 8, 8, 2), "relu", generator=torch.Generator().manual_seed(0))
+    x = torch.randn(5, 4, generator=torch.Generator().manual_seed(1))
+    for index in range(3):
+        assert torch.allclose(stack.member(index)(x)[0], stack(x)[index], atol=1e-6)
+    single, before = stack.member(1), stack(x)[1].clone()
+    with torch.no_grad():
+        single.parameters.add_(1.0)
+    assert torch.equal(stack(x)[1], before)  # it shares nothing

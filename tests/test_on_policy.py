@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import io
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from safemr.errors import UserError
 from safemr.experiment.config import load
 from safemr.experiment.planning import resolve
 from safemr.learning.evaluation import evaluate
+from safemr.learning.hyperparameters import resolved
 from safemr.learning.on_policy import Batch, explained_variance
 from safemr.learning.policies import Policy
 from safemr.learning.rollouts import Rollout, gae, minibatches
@@ -87,13 +87,13 @@ def test_returns_with_three_kinds_of_end_inside_the_batch():
         finals = None
         if t == 1:
             truncated[1], terminated[2] = True, True  # in environments 1 and 2, at step 1
-            finals = torch.tensor([[0.0], [40.0], [80.0]])
-        observations = torch.tensor([[1.0], [2.0], [3.0]]) + t
+            finals = np.array([[0.0], [40.0], [80.0]], np.float32)
+        observations = np.array([[1.0], [2.0], [3.0]], np.float32) + t
         rewards = np.array([1.0, 2.0, 3.0])
         rollout.add(
-            observations, torch.zeros(3, 1), rewards, -rewards, terminated, truncated, finals
+            observations, np.zeros((3, 1)), rewards, -rewards, terminated, truncated, finals
         )
-    rollout.close(torch.tensor([[16.0], [32.0], [64.0]]))
+    rollout.close(np.array([[16.0], [32.0], [64.0]], np.float32))
     values, following = rollout.values(lambda x: torch.stack([x, 10.0 * x]))
     np.testing.assert_array_equal(values[0], [[1, 2, 3], [2, 3, 4], [3, 4, 5]])
     np.testing.assert_array_equal(following[0], [[2, 3, 4], [3, 40, 0], [16, 32, 64]])
@@ -119,14 +119,14 @@ def test_collected_rollout_bootstraps_across_the_autoreset():
     restarted = rollout.observations[40, :, 0].numpy()
     assert np.abs(restarted).max() <= 0.1
     assert np.abs(last - restarted).max() > 0.1
-    assert batch.episode_length == 40.0
+    assert batch.episode_decisions == 40.0
 
 
 def test_episode_cost_without_a_finished_episode_extrapolates_the_rate():
     run = trainer("ppo_lagrangian", epoch_steps=25 * 20)
     run._collect()
     run.rollout.signals[1] = 0.25
-    assert run.episode_cost(0) == (10.0, 40.0)
+    assert run.episode_cost(0, 25 * 20) == (10.0, 40.0)
 
 
 def test_advantages_are_standardised_for_reward_and_centred_for_cost():
@@ -299,7 +299,7 @@ def test_published_settings_are_valid(name):
     assert module.Config() != config
     runs = resolve(load(["config/config.yaml", "config/published.yaml"])).runs
     (run,) = (run for run in runs if run.config["algorithm"]["name"] == name)
-    assert run.config["algorithm"]["hyperparameters"] == asdict(config)
+    assert run.config["algorithm"]["hyperparameters"] == resolved(config)
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import MappingProxyType, ModuleType
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -197,3 +200,64 @@ def test_a_provenance_of_another_type_is_refused(tmp_path, origin):
     silent(tmp_path, 0, origin)
     with pytest.raises(records.RecordError, match=next(iter(origin))):
         records.read_records(tmp_path)
+
+
+def example() -> ModuleType:
+    """The program as a module."""
+    spec = importlib.util.spec_from_file_location("cross_entropy", PROGRAM)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Recorder:
+    """Two worlds that cost 1 a control step and end after 7 and 5; it remembers the actions."""
+
+    observation_layout = MappingProxyType({"velocimeter": slice(0, 3), "gyro": slice(3, 6)})
+
+    def __init__(self) -> None:
+        self.random, self.actions = np.random.default_rng(0), []
+
+    def reset(self, seed):
+        return self.random.standard_normal((2, 6)), {}
+
+    def step(self, actions):
+        self.actions.append(actions.copy())
+        ended, ones = len(self.actions) == np.array([7, 5]), np.ones(2)
+        infos = {"cost": ones, "cost_indicator": ones}
+        return self.random.standard_normal((2, 6)), ones, ended, np.zeros(2, bool), infos
+
+
+def test_the_program_holds_and_scales_its_actions_and_counts_control_steps():
+    weights = np.random.default_rng(1).standard_normal((2, 4, 2))
+    envs = Recorder()
+    sums = example().play(envs, weights, 0, {"action_repeat": 3, "action_scale": [0.05, 1.0]})
+    holds = [envs.actions[0:3], envs.actions[3:6], envs.actions[6:]]
+    assert all(np.array_equal(action, hold[0]) for hold in holds for action in hold)
+    assert not np.array_equal(holds[0][0], holds[1][0])
+    assert np.abs(envs.actions)[..., 0].max() <= 0.05 < np.abs(envs.actions)[..., 1].max()
+    assert sums["cost"].tolist() == sums["length"].tolist() == [7.0, 5.0]
+    # As it is: a decision a control step, up to the limits of the action space.
+    envs = Recorder()
+    example().play(envs, weights, 0, {})
+    assert len(np.unique(np.array(envs.actions)[:, 0, 1].round(9))) > 3
+    assert np.abs(envs.actions)[..., 0].max() > 0.05
+
+
+def test_budget_and_evaluation_of_the_program_are_in_control_steps(monkeypatch):
+    program, seen = example(), []
+    real = program.play
+    monkeypatch.setattr(program, "play", lambda *given: seen.append(given[3]) or real(*given))
+    entry = {"action_repeat": 7}
+    config = {
+        "task": {"name": "Pillars-0.15-Goal", "settings": {"max_episode_steps": 20}},
+        "algorithm": {"hyperparameters": {"population": 4, "elites": 2}},
+        "seed": 100, "steps": 240, "evaluation": {"every": 160, "episodes": 2, "seed": 1},
+        "interface": entry,
+    }  # fmt: skip
+    rows = program.search(config)
+    assert [row["step"] for row in rows] == [80, 160, 240]
+    assert [row.get("eval_length") for row in rows] == [None, 20.0, 20.0]
+    assert seen == [entry] * 5

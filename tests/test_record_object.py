@@ -13,6 +13,7 @@ from safemr.errors import UserError
 from safemr.experiment import records
 from safemr.experiment.record import Record
 from safemr.experiment.records import RecordError
+from safemr.learning.interface import Interface
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -33,6 +34,18 @@ def test_it_says_what_was_written(folder: Path) -> None:
     assert record.has_policy
     assert record.policy_arrays().keys() == POLICY.keys()
     np.testing.assert_array_equal(record.policy_arrays()["weights"], POLICY["weights"])
+
+
+def test_it_says_how_its_task_was_met(tmp_path: Path) -> None:
+    entry = {"action_repeat": 5, "action_scale": [0.05, 1.0], "decode": ["goal_lidar"]}
+    for place, changes, expected in (
+        ("plain", {}, Interface()),
+        ("held", {"interface": entry}, Interface(5, (0.05, 1.0), ("goal_lidar",))),
+    ):
+        assert Record.open(make_record(tmp_path / place, **changes)).interface == expected
+    folder = make_record(tmp_path, interface={"action_repeats": 5})
+    with pytest.raises(UserError, match=r"'action_repeats' in .*interface"):
+        _ = Record.open(folder).interface
 
 
 def test_it_is_what_was_verified(folder: Path) -> None:

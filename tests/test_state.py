@@ -96,6 +96,7 @@ OTHERS = [
     ("safemr", "Hazards-0.15-Push", {"backend": "torch"}),
     ("safemr", "Aircraft", {}),
     ("ppo_lagrangian", "Aircraft", {}),
+    ("ppo_lagrangian", "Pillars-0.15-Goal", {"backend": "fused"}),
 ]
 
 

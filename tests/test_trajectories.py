@@ -11,6 +11,7 @@ from safemr.certificates.energy import energy, largest
 from safemr.certificates.falsification import make_simulator
 from safemr.errors import UserError
 from safemr.learning.evaluation import evaluate
+from safemr.learning.interface import Interface
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy, network_arrays
@@ -33,7 +34,11 @@ def policy() -> Policy:
     return Policy(transform, actor, squash=True, extras=extras)
 
 
-def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
+@pytest.mark.parametrize("action_repeat", [1, 7])
+def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path, action_repeat):
+    policy = Policy(
+        policy.transform, policy.network, squash=True, interface=Interface(action_repeat)
+    )
     recorded = trajectories.episodes(policy, LAYOUT, seeds=[5, 6, 7], steps=60)
     envs = make_simulator(LAYOUT, 3)
     scores = evaluate(policy, envs, seed=5)
@@ -46,6 +51,35 @@ def test_recorded_episodes_are_those_of_the_evaluation(policy, tmp_path):
     np.testing.assert_array_equal(scene.robot, recorded["robot"][60, 1])
     assert scene.box is None
     assert scene.task.d_min == pytest.approx(0.25)
+
+
+class Restless:
+    """A policy that never does the same twice and holds what it does for five control steps."""
+
+    action_repeat = 5
+
+    def __init__(self) -> None:
+        self.actions: list[np.ndarray] = []
+
+    def act(self, observations, deterministic=True):
+        generator = np.random.default_rng(len(self.actions))
+        actions = generator.uniform(-1, 1, (len(observations), 2)).astype(np.float32)
+        self.actions.append(actions)
+        return actions
+
+
+def test_every_control_step_of_a_held_action_is_recorded():
+    restless = Restless()
+    recorded = trajectories.episodes(restless, LAYOUT, seeds=[5, 6], steps=12)
+    assert len(restless.actions) == 3
+    envs = make_simulator(LAYOUT, 2)
+    envs.reset(seed=[5, 6])
+    for step in range(12):
+        _, reward, *_ = envs.step(restless.actions[step // 5])
+        np.testing.assert_array_equal(recorded["reward"][step], reward.astype(np.float32))
+        robots = np.array([envs.scene(index).robot for index in range(2)], np.float32)
+        np.testing.assert_array_equal(recorded["robot"][step + 1], robots)
+    envs.close()
 
 
 def test_no_more_steps_than_an_episode_has(policy):

@@ -46,16 +46,26 @@ def features(layout: Mapping[str, slice], observations: Array) -> Array:
     return np.stack(columns, 1)
 
 
-def play(environments: Any, weights: Array, seed: int | None) -> dict[str, Array]:
-    """One episode of each policy, weights [N, F, act]; sums over the episode, each [N]."""
+def play(
+    environments: Any, weights: Array, seed: int | None, interface: Mapping[str, Any]
+) -> dict[str, Array]:
+    """One episode of each policy, weights [N, F, act]; sums over the episode, each [N].
+
+    An action is held for ``action_repeat`` control steps, after which all policies, whose episodes
+    begin together, decide anew; every control step counts in the sums.
+    """
+    repeat = interface.get("action_repeat", 1)
+    scale = np.array(interface.get("action_scale", 1.0))
     observations, _ = environments.reset(seed=seed)
-    count = len(weights)
+    count, step = len(weights), 0
     running = np.ones(count, bool)
     names = ("return", "cost", "cost_indicator", "goals", "length")
     sums = {name: np.zeros(count) for name in names}
     while running.any():
-        inputs = features(environments.observation_layout, observations)
-        actions = np.clip(np.einsum("no,noa->na", inputs, weights), -1.0, 1.0)
+        if step % repeat == 0:
+            inputs = features(environments.observation_layout, observations)
+            actions = scale * np.clip(np.einsum("no,noa->na", inputs, weights), -1.0, 1.0)
+        step += 1
         observations, rewards, terminated, truncated, infos = environments.step(actions)
         goals = infos.get("goal_met", np.zeros(count))  # where a task has goals
         terms = (rewards, infos["cost"], infos["cost_indicator"], goals, running)
@@ -78,7 +88,7 @@ def search(config: Mapping[str, Any]) -> list[dict[str, float]]:
     """Runs the search; one row of metrics a generation, with the mean policy's evaluation."""
     settings = DEFAULTS | dict(config["algorithm"]["hyperparameters"])
     population, task = int(settings["population"]), config["task"]
-    evaluation = config["evaluation"]
+    evaluation, interface = config["evaluation"], config.get("interface", {})
 
     def make(count: int) -> Any:
         registered = task.get("base", task["name"])  # a task with other settings has its own name
@@ -96,7 +106,8 @@ def search(config: Mapping[str, Any]) -> list[dict[str, float]]:
     step, begun = 0, time.perf_counter()
     while step < config["steps"]:
         candidates = mean + spread * random.standard_normal((population, *shape))
-        sums = play(environments, candidates, int(random.integers(2**31)) if not rows else None)
+        seed = int(random.integers(2**31)) if not rows else None
+        sums = play(environments, candidates, seed, interface)
         order = np.argsort(settings["penalty"] * sums["cost"] - sums["return"])
         elites = candidates[order[: int(settings["elites"])]]
         mean = elites.mean(0)
@@ -105,7 +116,7 @@ def search(config: Mapping[str, Any]) -> list[dict[str, float]]:
         row = {"step": step, **summary(sums, "train"), "spread": float(spread.mean())}
         if step // evaluation["every"] > before // evaluation["every"] or step >= config["steps"]:
             policies = np.repeat(mean[None], evaluation["episodes"], 0)
-            row |= summary(play(test, policies, evaluation["seed"]), "eval")
+            row |= summary(play(test, policies, evaluation["seed"], interface), "eval")
         rows.append(row | {"time_wall_s": time.perf_counter() - begun})
     return rows
 

@@ -26,6 +26,7 @@ from safemr.aircraft.scoring import TrueSets, learners
 from safemr.aircraft.slices import Slice
 from safemr.aircraft.unsafe_sets import Energy, Truth, of_states
 from safemr.algorithms.neural_safemr import NeuralCertificate, neural_energy
+from safemr.certificates.families import PAPER, named
 from safemr.conventions import COVERS
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
@@ -52,8 +53,14 @@ def recorded_energies(
 
 def settings_of(hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
     """The arguments of `fit_to_truth` that make its energy that of a run."""
+    family = named(hyperparameters.get("family", PAPER.name))
+    if family is PAPER:
+        zeta = [hyperparameters[name] for name in family.names]
+    else:
+        zeta = hyperparameters.get("start") or [each.start for each in family.parameters]
     return {
-        "zeta": [hyperparameters[name] for name in ("sigma", "k", "n")],
+        "zeta": list(zeta),
+        **({"family": family.name} if family is not PAPER else {}),
         "length_scale": hyperparameters["length_scale"],
         "smoothing": hyperparameters["smoothing"],
         "hidden": hyperparameters["certificate_hidden"],
@@ -71,6 +78,7 @@ def fit_to_truth(
     batch: int = 1024,
     lr: float = 5e-3,
     seed: int = 100,
+    family: str = PAPER.name,
 ) -> Energy:
     """The control: f by logistic regression of {V <= 0} on phi / tau, outside the disc.
 
@@ -81,7 +89,8 @@ def fit_to_truth(
     states, unsafe = truth.states[outside], torch.from_numpy(truth.unsafe[outside]).float()
     transform = ObservationTransform.for_layout(AircraftVectorEnv.observation_layout)
     fixed: dict[str, Any] = {
-        **{"zeta": torch.tensor(zeta), "length_scale": length_scale, "smoothing": smoothing}
+        **{"zeta": torch.tensor(zeta), "length_scale": length_scale, "smoothing": smoothing},
+        "energy_family": named(family),
     }
     generator = torch.Generator().manual_seed(seed)
     network = StackedMLP(

@@ -2,7 +2,8 @@
 
 A *comparison* is a DataFrame with one row per certificate (and policy, where there is one): the
 recorded runs, then fixed references. Columns: ``kind`` ("learner", "certificate", "policy"),
-``variant``, ``seed`` (-1 for references), ``sigma, k, n`` in units of ``length_scale`` metres,
+``variant``, ``seed`` (-1 for references), ``sigma, k, n`` in units of ``length_scale`` metres, or
+the parameters of another family and its name as ``family``,
 ``eta`` in units of phi, `COLUMNS` of `unsafe_sets.CertificateMetrics`, ``least_volume_ratio`` (the
 frontier's at the same missed share), and those of `unsafe_sets.Flights.summary`. What does not
 apply to a row is nan.
@@ -29,6 +30,7 @@ from safemr.aircraft.slices import Slice
 from safemr.aircraft.unsafe_sets import Truth
 from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.certificates.energy import constraint
+from safemr.certificates.families import PAPER, Parameters, named
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
@@ -177,7 +179,7 @@ def compare(
 
         def measure(
             record: Record = record, learned: EnergyCertificate = learned
-        ) -> dict[str, float]:
+        ) -> dict[str, Any]:
             own = _certificate(sets.truth, learned)
             return own | flights_of(record.policy(), sets.starts(flights), sets.truth)
 
@@ -224,18 +226,22 @@ def _references(sets: TrueSets, flights: int) -> list[dict[str, Any]]:
 
 def as_scores(comparison: pd.DataFrame, task: str = paper.AIRCRAFT_TASK) -> pd.DataFrame:
     """The learners' rows as a score table: task, variant, seed, metric, value."""
-    learners = comparison[comparison["kind"] == "learner"].drop(columns=["kind", "covers"])
+    learners = comparison[comparison["kind"] == "learner"]
+    learners = learners.drop(columns=["kind", "covers", "family"], errors="ignore")
     tidy = learners.melt(id_vars=["variant", "seed"], var_name="metric").dropna(subset="value")
     return tidy.assign(task=task, value=tidy["value"].astype(float))
 
 
-def learned_zetas(comparison: pd.DataFrame, variant: str) -> list[tuple[Floats, float]]:
+def learned_zetas(comparison: pd.DataFrame, variant: str) -> list[tuple[Parameters, float]]:
     """(zeta, length_scale) of each seed of a variant."""
     chosen = comparison[(comparison["kind"] == "learner") & (comparison["variant"] == variant)]
-    return [
-        (row[["sigma", "k", "n"]].to_numpy(float), float(row["length_scale"]))
-        for _, row in chosen.sort_values("seed").iterrows()
-    ]
+    found = []
+    for _, row in chosen.sort_values("seed").iterrows():
+        said = row.get("family")
+        family = named(said) if isinstance(said, str) else PAPER
+        zeta = family.at(row[list(family.names)].to_numpy(float))
+        found.append((zeta, float(row["length_scale"])))
+    return found
 
 
 def plane(spacing: float) -> tuple[Floats, Floats]:
@@ -283,8 +289,8 @@ def slices(
         if variant not in handcrafted
     }
 
-    def claimed(states: Floats, zeta: Sequence[float] | Floats, length_scale: float) -> Floats:
-        phi = unsafe_sets.energy_of(dynamics, list(zeta), length_scale)(states)
+    def claimed(states: Floats, zeta: Parameters, length_scale: float) -> Floats:
+        phi = unsafe_sets.energy_of(dynamics, zeta, length_scale)(states)
         return np.maximum(phi, dynamics.d_min - dynamics.separation(states))
 
     cuts = []
@@ -306,11 +312,13 @@ def slices(
     return x, y, cuts
 
 
-def _certificate(truth: Truth, certificate: EnergyCertificate) -> dict[str, float]:
+def _certificate(truth: Truth, certificate: EnergyCertificate) -> dict[str, Any]:
     phi = unsafe_sets.of_states(truth.dynamics, certificate)
     metrics = asdict(unsafe_sets.compare_certificate(truth, phi, certificate.eta))
+    family = certificate.energy_family
     return {
         **certificate.parameters,
+        **({"family": family.name} if family is not PAPER else {}),
         "length_scale": certificate.length_scale,
         "eta": certificate.eta,
         **{name: metrics[name] for name in COLUMNS},

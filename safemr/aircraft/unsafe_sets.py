@@ -13,6 +13,7 @@ that does so gives the least volume. `frontier` therefore searches k and n only.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,7 @@ from safemr.aircraft.reachability.grid import Floats
 from safemr.aircraft.reachability.solver import CONSTANT, Solution
 from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.certificates.energy import energy, magnitude, scaled
+from safemr.certificates.families import Values
 from safemr.conventions import COVERS
 from safemr.errors import UserError
 from safemr.learning.evaluation import Acts
@@ -108,8 +110,10 @@ def of_states(dynamics: AircraftDynamics, certificate: Certificate) -> Energy:
 def energy_of(
     dynamics: AircraftDynamics, zeta: Sequence[float], length_scale: float = 1.0
 ) -> Energy:
-    """phi of zeta = [sigma, k, n] with lengths in units of ``length_scale`` [m]."""
-    given = EnergyCertificate("zeta", Zeta(*zeta), length_scale=length_scale)
+    """phi of zeta, [sigma, k, n] where it is of no other family, with lengths in units of
+    ``length_scale`` [m]."""
+    point = zeta if isinstance(zeta, Values) else Zeta(*zeta)
+    given = EnergyCertificate("zeta", point, length_scale=length_scale)
     return of_states(dynamics, given)
 
 
@@ -302,8 +306,12 @@ def fly(policy: Acts, starts: Floats, dynamics: AircraftDynamics) -> Flights:
     running = np.ones(len(starts), bool)
     collided, effort = np.zeros(len(starts), bool), np.zeros(len(starts))
     steps, least = np.zeros(len(starts), np.int64), infos["d"][:, 0].copy()
-    while running.any():
-        actions = policy.act(observations, deterministic=True)
+    action_repeat = getattr(policy, "action_repeat", 1)
+    for step in itertools.count():
+        if not running.any():
+            break
+        if step % action_repeat == 0:
+            actions = policy.act(observations, deterministic=True)
         observations, rewards, terminated, truncated, infos = envs.step(actions)
         d = infos["d"][:, 0].copy()
         if "final_info" in infos:

@@ -5,7 +5,7 @@ Achiam, Held, Tamar & Abbeel, "Constrained policy optimization" (arXiv:1705.1052
     min_x g.x   subject to   c + b.x <= 0   and   x.Hx / 2 <= delta,
 
 g the gradient of -E[r A], b that of the predicted change of an episode's cost, L E[r A_cost] with L
-the episode's length in steps, c = EpCost - cost_limit, H the Fisher matrix, delta = target_kl.
+the episode's length in decisions, c = EpCost - cost_limit, H the Fisher matrix, delta = target_kl.
 
 | equation | function |
 |---|---|
@@ -30,15 +30,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
-
 from safemr.learning import on_policy
-from safemr.learning.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
+from safemr.learning.on_policy import OnPolicyConfig, OnPolicyTrainer
+from safemr.learning.rollouts import Batch
 from safemr.learning.trust_region import (
+    Region,
     TrustRegionConfig,
     conjugate_gradient,
     dot,
-    fisher_vector_product,
     line_search,
 )
 
@@ -121,22 +120,20 @@ class Trainer(OnPolicyTrainer):
     def update_policy(self, batch: Batch) -> dict[str, float]:
         config = self.config
         c = batch.episode_cost - config.cost_limit
-        ratio, _ = ratio_and_kl(self.actor, batch)
-        loss = -(ratio * batch.advantages).mean()
-        cost = batch.episode_length * (ratio * batch.cost_advantages).mean()
-        g = self.actor.gradient(loss, retain_graph=True)
-        b = self.actor.gradient(cost)
-        product = fisher_vector_product(self.actor, batch.observations, config.damping)
+        region, length = self.region(batch), batch.episode_decisions
+        before = (float(-region.old[0]), float(length * region.old[1]))
+        g = region.gradient(lambda reward, _: -reward)
+        b = region.gradient(lambda _, cost: length * cost)
+        product = region.product(config.damping)
         v = conjugate_gradient(product, g, config.conjugate_gradient_iterations)
         w = conjugate_gradient(product, b, config.conjugate_gradient_iterations)
         image_v, image_w = product(v), product(w)
         products = (dot(v, image_v), dot(w, image_v), dot(w, image_w))
         dual = solve_dual(*products, c, config.target_kl, config.cost_tolerance)
-        before = (float(loss.detach()), float(cost.detach()))
         allowed = max(-c, 0.0) + config.cost_tolerance
 
         def accept() -> bool:
-            return self._accepts(batch, dual.case, allowed, before)
+            return self._accepts(region, length, dual.case, allowed, before)
 
         step = -(dual.along_reward * v + dual.along_cost * w)
         metrics = line_search(self.actor, step, accept, config)
@@ -154,18 +151,22 @@ class Trainer(OnPolicyTrainer):
                 metrics[name] = value
         return metrics
 
-    @torch.no_grad()
     def _accepts(
-        self, batch: Batch, case: int, allowed: float, before: tuple[float, float]
+        self,
+        region: Region,
+        length: float,
+        case: int,
+        allowed: float,
+        before: tuple[float, float],
     ) -> bool:
         """Whether the moved actor obeys the KL bound, and the surrogates what the case asks.
 
-        The predicted cost may rise by ``allowed`` at most; the reward must not fall unless the case
-        is a recovery (0, 1). ``before`` holds the loss and the cost at the old policy.
+        The predicted cost of an episode of ``length`` decisions may rise by ``allowed`` at most;
+        the reward must not fall unless the case is a recovery (0, 1). ``before`` holds the loss and
+        the cost at the old policy.
         """
-        ratio, kl = ratio_and_kl(self.actor, batch)
-        loss = -float((ratio * batch.advantages).mean())
-        cost = batch.episode_length * float((ratio * batch.cost_advantages).mean())
+        reward, cost_a_decision, kl = region.surrogates()
+        loss, cost = -float(reward), length * float(cost_a_decision)
         return (
             float(kl) <= self.config.target_kl
             and (case <= 1 or loss <= before[0])

@@ -3,7 +3,8 @@
 Ma et al., "Feasible actor-critic: constrained reinforcement learning for ensuring statewise
 safety" (2021), as used by the SafeMR paper with a fixed energy function: phi_0 = d_min - d is
 zeta = [0, 0, 1] and phi_h = (0.3 + d_min)^2 - d^2 - k d_dot is zeta = [0.3, k, 2]. JointSIS and
-SafeMR extend this file by their certificate loss.
+SafeMR extend this file by their certificate loss. Another family of energy functions than that of
+[sigma, k, n] is asked for by ``family`` (`safemr.certificates.families`).
 
 | equation of the paper | function |
 |---|---|
@@ -27,16 +28,18 @@ smaller networks for a budget two orders of magnitude smaller.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from safemr.certificates import energy
+from safemr.certificates import energy, families
+from safemr.errors import UserError
 from safemr.learning import off_policy
 from safemr.learning.losses import REWARD_CRITICS
+from safemr.learning.policies import network_arrays
 from safemr.learning.replay import Batch
 from safemr.learning.soft_actor_critic import SoftActorCritic, SoftActorCriticConfig
 
@@ -59,6 +62,9 @@ class Config(SoftActorCriticConfig):
     n: float = 2.0  # of zeta: exponent of phi
     eta: float = 0.0  # eta_D; the point robot cannot sustain a descent of 0.1 a step
     length_scale: float = 1.0  # unit of length in phi [m]; 1 = the paper's
+    family: str = "paper"  # of energy functions; another one by its module, PACKAGE.MODULE
+    start: tuple[float, ...] = ()  # another family's parameters, in its order; empty: its own start
+    family_version: int = 0  # of another family; 0: that of the installed one, which a record says
 
     # Constraint
 
@@ -68,13 +74,62 @@ class Config(SoftActorCriticConfig):
     constraint_floor: float = -0.001
     constraint_scale: float = 10.0  # Q_phi learns scale * g, so that its errors count beside Q_w's
     multiplier_bias: float = -3.0  # start of the last layer's bias
+    record_critic: bool = False  # keep Q_phi in the policy file, as a model of the safety filter
 
     RANGES: ClassVar[Mapping[str, str]] = {
         **dict.fromkeys(("sigma", "n", "eta"), "[0, 10]"),
         "k": "[0, 100]",
         "length_scale": "[0.001, 1000]",
+        "family_version": "[0, inf)",
         "constraint_floor": "[-inf, 0]",
     }
+    ADDED: ClassVar[frozenset[str]] = frozenset(
+        {"family", "start", "family_version", "record_critic"}
+    )
+    # What says the parameters of the paper's family, and no other's.
+    PAPERS: ClassVar[tuple[str, ...]] = ("sigma", "k", "n")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "start", tuple(map(float, self.start)))  # a record has a list
+        family = families.named(self.family)
+        object.__setattr__(self, "family", family.name)
+        if family is families.PAPER:
+            self.require("start", not self.start, "of another family; here set sigma, k and n")
+            self.require("family_version", not self.family_version, "another family has one")
+            return
+        defaults = {field.name: field.default for field in fields(self)}
+        for name in self.PAPERS:
+            self.require(
+                name,
+                getattr(self, name) == defaults[name],
+                f"is of the paper's family; the start of {family.name} is set by start, its box in "
+                "its file",
+            )
+        self.require(
+            "start",
+            len(self.start) in (0, len(family.names)),
+            f"must be {len(family.names)} numbers: {', '.join(family.names)}",
+        )
+        self.require(
+            "family_version",
+            self.family_version in (0, family.version),
+            f"the installed {family.name} is version {family.version}; install the one that the "
+            "record was made with, or resolve the configuration anew",
+        )
+        object.__setattr__(self, "family_version", family.version)
+
+    @property
+    def energy_family(self) -> families.EnergyFamily:
+        """The family of energy functions."""
+        return families.named(self.family)
+
+    @property
+    def first_zeta(self) -> tuple[float, ...]:
+        """The parameters at the start, in the family's order."""
+        if self.energy_family is families.PAPER:
+            return self.sigma, self.k, self.n
+        return self.start or tuple(each.start for each in self.energy_family.parameters)
 
 
 def constraint_values(batch: Batch, zeta: Tensor, d_min: float, config: Config) -> Tensor:
@@ -85,13 +140,39 @@ def constraint_values(batch: Batch, zeta: Tensor, d_min: float, config: Config) 
     d = torch.stack((batch.d, batch.d_next))
     d_dot = torch.stack((batch.d_dot, batch.d_dot_next))
     lengths = energy.scaled(d, d_dot, d_min, config.length_scale)
-    phi, phi_next = energy.largest(energy.energy(*lengths, *zeta.unbind()))
+    phi, phi_next = energy.largest(config.energy_family.phi(*lengths, *zeta.unbind()))
     return energy.constraint(phi, phi_next, config.eta).clamp_min(config.constraint_floor)
 
 
-class Agent(SoftActorCritic):
-    """Soft actor-critic whose constraint is the change of an energy function, zeta = [sigma, k, n].
+def _try_on_tensors(config: Config) -> None:
+    """Raises UserError where another family's phi is no differentiable function of tensors."""
+    family = config.energy_family
+    zeta = torch.tensor(config.first_zeta, dtype=torch.float64, requires_grad=True)
+    d, d_dot = torch.meshgrid(
+        torch.linspace(0.5, 4.0, 5).double(), torch.linspace(-1.0, 1.0, 5).double(), indexing="ij"
+    )
+    try:
+        phi = family.phi(d, d_dot, 0.5, *zeta.unbind())
+        term = family.magnitude(0.5, *zeta.unbind(), 1.0, 1.0)
+        (gradient,) = torch.autograd.grad(phi.sum() + term, [zeta])
+    except (TypeError, AttributeError, RuntimeError, ValueError) as error:
+        reason = str(error).partition("\n")[0]
+        raise UserError(
+            f"{family.name}: phi does not work on torch tensors: {type(error).__name__}: {reason}; "
+            "write it with operators (+, *, **, <), as safemr.certificates.energy does"
+        ) from error
+    with_arrays = family.phi(d.numpy(), d_dot.numpy(), 0.5, *config.first_zeta)
+    if not np.allclose(phi.detach().numpy(), with_arrays) or not bool(gradient.isfinite().all()):
+        raise UserError(
+            f"{family.name}: phi of torch tensors is not that of numpy arrays, or its gradient is "
+            "not finite"
+        )
 
+
+class Agent(SoftActorCritic):
+    """Soft actor-critic whose constraint is the change of an energy function of zeta.
+
+    zeta are the parameters of the family, the paper's [sigma, k, n] where no other is asked for.
     JointSIS and SafeMR move zeta in `update_certificate`; `constraint_target` is what another
     energy function overrides.
     """
@@ -100,7 +181,8 @@ class Agent(SoftActorCritic):
 
     def __init__(self, config: Config, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
-        self.zeta = torch.tensor([config.sigma, config.k, config.n], device=config.device)
+        self.zeta = torch.tensor(config.first_zeta, device=config.device)
+        _try_on_tensors(config)
 
     def constraint_target(self, batch: Batch) -> Tensor:
         """What Q_phi regresses on, [B]; here max(g, floor), no bootstrap."""
@@ -117,13 +199,21 @@ class Agent(SoftActorCritic):
 
     def metrics(self) -> dict[str, float]:
         """zeta beside the base's."""
-        sigma, k, n = self.zeta.tolist()
-        return {"sigma": sigma, "k": k, "n": n, **super().metrics()}
+        names = self.config.energy_family.names
+        return {**dict(zip(names, self.zeta.tolist(), strict=True)), **super().metrics()}
 
     def extras(self) -> dict[str, Any]:
-        """zeta and its unit beside the base's."""
+        """zeta and its unit beside the base's, its family where it is not the paper's, and Q_phi
+        where it is asked for."""
+        name = self.config.energy_family.name
+        critic: dict[str, Any] = {}
+        if self.config.record_critic:
+            critic |= network_arrays("critic", self.critics.member(REWARD_CRITICS))
+            critic["critic_scale"] = np.array(self.config.constraint_scale)
         return {
             **super().extras(),
+            **critic,
+            **({"family": np.array(name)} if name != families.PAPER.name else {}),
             "zeta": self.zeta.detach().cpu().numpy().copy(),
             "length_scale": np.array(self.config.length_scale),
         }

@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from safemr.algorithms import fac
+from safemr.certificates import families
 from safemr.learning.losses import Info
 from safemr.learning.replay import Batch
 
@@ -65,11 +66,30 @@ class Config(fac.Config):
         "certificate_constraint": ("floored", "literal", "released"),
     }
 
+    PAPERS: ClassVar[tuple[str, ...]] = (
+        *fac.Config.PAPERS,
+        *(f"{name}_{end}" for end in ("min", "max") for name in fac.Config.PAPERS),
+    )
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("sigma", "k", "n"):
-            low, high = getattr(self, f"{name}_min"), getattr(self, f"{name}_max")
-            self.require(name, low <= getattr(self, name) <= high, f"must lie in [{low}, {high}]")
+        names, papers = self.energy_family.names, self.energy_family is families.PAPER
+        for name, value, low, high in zip(names, self.first_zeta, *self.box, strict=True):
+            field, remedy = name, f"must lie in [{low}, {high}]"
+            if not papers:
+                field, remedy = "start", f"{name} {remedy}"
+            self.require(field, low <= value <= high, remedy)
+
+    @property
+    def box(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Least and largest value of each of the family's parameters."""
+        if self.energy_family is families.PAPER:
+            return (
+                (self.sigma_min, self.k_min, self.n_min),
+                (self.sigma_max, self.k_max, self.n_max),
+            )
+        parameters = self.energy_family.parameters
+        return tuple(each.low for each in parameters), tuple(each.high for each in parameters)
 
     def delays(self) -> tuple[str, ...]:
         return (*super().delays(), "certificate_delay")
@@ -106,11 +126,7 @@ class Agent(fac.Agent):
 
     def __init__(self, config: Config, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
-        bounds = [
-            [getattr(config, f"{name}_{end}") for name in ["sigma", "k", "n"]]
-            for end in ("min", "max")
-        ]
-        self._low, self._high = torch.tensor(bounds, device=config.device)
+        self._low, self._high = torch.tensor(config.box, device=config.device)
         first = int(config.certificate_start * self.total_updates)
         moves = max((self.total_updates - first) // config.certificate_delay, 1)
         self._first_update = first
@@ -132,13 +148,11 @@ class Agent(fac.Agent):
         left = (self.total_updates - self.updates) / (self.total_updates - self._first_update)
         self.zeta.sub_(gradient, alpha=self._rate * max(left, 0.0))
         torch.clamp(self.zeta, self._low, self._high, out=self.zeta)
-        sigma, k, n = gradient
+        names = self.config.energy_family.names
         return {
             "certificate_loss": loss.detach(),
             "certificate_grad_norm": gradient.norm(),
-            "certificate_grad_sigma": sigma,
-            "certificate_grad_k": k,
-            "certificate_grad_n": n,
+            **{f"certificate_grad_{name}": g for name, g in zip(names, gradient, strict=True)},
         }
 
 

@@ -46,6 +46,7 @@ from safemr.certificates.certificate import (
     Recorded,
     refuse_other_family,
 )
+from safemr.certificates.families import PAPER, EnergyFamily, named
 from safemr.errors import UserError
 from safemr.learning.contract import generator
 from safemr.learning.losses import Info
@@ -104,13 +105,14 @@ def neural_energy(
     zeta: Tensor,
     length_scale: float,
     smoothing: float,
+    energy_family: EnergyFamily = PAPER,
 ) -> Tensor:
     """phi [B] at transformed observations [B, D] with d, d_dot [B, M], differentiable in theta.
 
-    Over M obstacles phi_0 and phi_zeta are the largest.
+    Over M obstacles phi_0 and phi_zeta, which is of ``energy_family``, are the largest.
     """
     d, d_dot, least = energy.scaled(d, d_dot, d_min, length_scale)
-    handcrafted = energy.largest(energy.energy(d, d_dot, least, *zeta.unbind()))
+    handcrafted = energy.largest(energy_family.phi(d, d_dot, least, *zeta.unbind()))
     contact = energy.largest(least - d)
     return energy.corrected(handcrafted, contact, network(observations)[0, :, 0], smoothing)
 
@@ -126,11 +128,12 @@ class NeuralCertificate(Certificate, family="neural"):
     name: str
     network: StackedMLP
     transform: ObservationTransform
-    zeta: Tensor  # [3], fixed
+    zeta: Tensor  # fixed; the paper's [3], or another family's
     smoothing: float  # tau, in units of length_scale
     eta: float = 0.0
     length_scale: float = 1.0
     record: Recorded | None = None
+    energy_family: EnergyFamily = PAPER  # of the fixed part
 
     @classmethod
     def from_record(cls, record: Recorded) -> Self:
@@ -156,12 +159,13 @@ class NeuralCertificate(Certificate, family="neural"):
             eta,
             float(saved["length_scale"]),
             record,
+            named(str(saved.get("family", PAPER.name))),
         )
 
     @property
     def parameters(self) -> Mapping[str, float]:
         """The fixed zeta and the smoothing; f's are in ``network``."""
-        zeta = dict(zip(("sigma", "k", "n"), self.zeta.tolist(), strict=True))
+        zeta = dict(zip(self.energy_family.names, self.zeta.tolist(), strict=True))
         return {**zeta, "smoothing": self.smoothing}
 
     @torch.no_grad()
@@ -193,6 +197,7 @@ class NeuralCertificate(Certificate, family="neural"):
                 zeta=self.zeta,
                 length_scale=self.length_scale,
                 smoothing=self.smoothing,
+                energy_family=self.energy_family,
             )
             parts.append(phi.numpy())
         return np.concatenate(parts).astype(float).reshape(shape)
@@ -247,6 +252,7 @@ class Agent(fac.Agent):
             zeta=self.zeta,
             length_scale=self.config.length_scale,
             smoothing=self.config.smoothing,
+            energy_family=self.config.energy_family,
         )
         now, following = phi.chunk(2)
         return now, following

@@ -29,9 +29,10 @@ from torch import Tensor
 
 from safemr.learning import on_policy
 from safemr.learning.contract import MakeEnvs
+from safemr.learning.gaussian import ratio_and_kl
 from safemr.learning.lagrange import Multiplier, MultiplierConfig, penalised
-from safemr.learning.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
-from safemr.learning.rollouts import minibatches
+from safemr.learning.on_policy import OnPolicyConfig, OnPolicyTrainer
+from safemr.learning.rollouts import Batch, minibatches
 
 VERSION = 1
 
@@ -103,18 +104,32 @@ class Trainer(OnPolicyTrainer):
         clipped: list[Tensor] = []
         for _ in range(config.policy_passes):
             for indices in minibatches(len(batch.actions), config.policy_batch, self.order):
-                part = batch.select(indices)
-                ratio, kl = ratio_and_kl(self.actor, part)
-                if float(kl.detach()) > config.kl_stop * config.target_kl:
+                step = self._step(batch, indices, multiplier)
+                if step is None:
                     return losses, clipped
-                loss = policy_loss(ratio, part, config.clip, multiplier)
-                gradients = torch.autograd.grad(loss, self.actor.parameters)
-                for parameter, gradient in zip(self.actor.parameters, gradients, strict=True):
-                    parameter.grad = gradient
-                self.policy_optimizer.step()
-                losses.append(loss.detach())
-                clipped.append(((ratio.detach() - 1.0).abs() > config.clip).float().mean())
+                losses.append(step[0])
+                clipped.append(step[1])
         return losses, clipped
+
+    def _step(
+        self, batch: Batch, indices: Tensor | slice, multiplier: float
+    ) -> tuple[Tensor, Tensor] | None:
+        """One step on a minibatch; loss and clipped share, or None where KL is above its bound."""
+        config, optimizer = self.config, self.policy_optimizer
+        bound = config.kl_stop * config.target_kl
+        if self.fused:
+            settings = (config.clip, multiplier, bound)
+            return self.fused.clipped_step(batch, indices, optimizer, *settings)
+        part = batch.select(indices)
+        ratio, kl = ratio_and_kl(self.actor, part)
+        if float(kl.detach()) > bound:
+            return None
+        loss = policy_loss(ratio, part, config.clip, multiplier)
+        gradients = torch.autograd.grad(loss, self.actor.parameters)
+        for parameter, gradient in zip(self.actor.parameters, gradients, strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+        return loss.detach(), ((ratio.detach() - 1.0).abs() > config.clip).float().mean()
 
     def state_dict(self) -> dict[str, Any]:
         return {

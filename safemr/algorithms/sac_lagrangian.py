@@ -43,7 +43,7 @@ VERSION = 1
 class Config(SoftActorCriticConfig):
     """Soft actor-critic's hyperparameters and the limit."""
 
-    cost_rate_limit: float = 0.0  # tolerated cost a step
+    cost_rate_limit: float = 0.0  # tolerated cost a decision
     n_step: int = 1  # the memory forms n-step sums of rewards only
 
     RANGES: ClassVar[Mapping[str, str]] = {"cost_rate_limit": "[0, 100]"}

@@ -17,7 +17,6 @@ from typing import ClassVar
 from torch import Tensor
 
 from safemr.algorithms import joint_sis
-from safemr.certificates import energy
 from safemr.learning.replay import Batch
 
 VERSION = 1
@@ -38,11 +37,13 @@ class Config(joint_sis.Config):
 def certificate_loss(
     batch: Batch, multipliers: Tensor, zeta: Tensor, d_min: float, config: Config
 ) -> Tensor:
-    """E[lambda(s) (phi(s') - max(phi(s) - eta_D, 0))] + a (sigma + d_min)^n + b k (Eq. SL2add)."""
-    sigma, k, n = zeta.unbind()
+    """E[lambda(s) (phi(s') - max(phi(s) - eta_D, 0))] + a (sigma + d_min)^n + b k (Eq. SL2add).
+
+    Of another family than the paper's, the last two are its own `magnitude`.
+    """
     data = joint_sis.certificate_loss(batch, multipliers, zeta, d_min, config)
     scaled_d_min = d_min / config.length_scale
-    return data + energy.magnitude(scaled_d_min, sigma, k, n, config.a, config.b)
+    return data + config.energy_family.magnitude(scaled_d_min, *zeta.unbind(), config.a, config.b)
 
 
 class Agent(joint_sis.Agent):

@@ -21,19 +21,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
-from torch import Tensor
-
 from safemr.learning import on_policy
 from safemr.learning.contract import MakeEnvs
 from safemr.learning.lagrange import Multiplier, MultiplierConfig, penalised
-from safemr.learning.on_policy import Batch, OnPolicyConfig, OnPolicyTrainer, ratio_and_kl
-from safemr.learning.trust_region import (
-    TrustRegionConfig,
-    fisher_vector_product,
-    line_search,
-    natural_step,
-)
+from safemr.learning.on_policy import OnPolicyConfig, OnPolicyTrainer
+from safemr.learning.rollouts import Batch
+from safemr.learning.trust_region import TrustRegionConfig, line_search, natural_step
 
 VERSION = 1
 
@@ -45,9 +38,8 @@ class Config(TrustRegionConfig, MultiplierConfig, OnPolicyConfig):
     """Hyperparameters: those of the three parents."""
 
 
-def policy_loss(ratio: Tensor, batch: Batch, multiplier: float) -> Tensor:
-    """-(E[r A] - lambda E[r A_cost]) / (1 + lambda); ratio [B]."""
-    reward, cost = (ratio * batch.advantages).mean(), (ratio * batch.cost_advantages).mean()
+def policy_loss(reward: Any, cost: Any, multiplier: float) -> Any:
+    """-(E[r A] - lambda E[r A_cost]) / (1 + lambda), linear in both surrogates."""
     return -penalised(reward, cost, multiplier)
 
 
@@ -64,18 +56,20 @@ class Trainer(OnPolicyTrainer):
         config = self.config
         self.multiplier.update(batch.episode_cost, config.cost_limit)
         multiplier = self.multiplier.value
-        loss = policy_loss(ratio_and_kl(self.actor, batch)[0], batch, multiplier)
-        gradient, before = self.actor.gradient(loss), float(loss.detach())
-        product = fisher_vector_product(self.actor, batch.observations, config.damping)
+        region = self.region(batch)
+
+        def loss(reward: Any, cost: Any) -> Any:
+            return policy_loss(reward, cost, multiplier)
+
+        before = float(loss(*region.old))
+        gradient, product = region.gradient(loss), region.product(config.damping)
         step = natural_step(
             product, gradient, config.target_kl, config.conjugate_gradient_iterations
         )
 
-        @torch.no_grad()
         def accept() -> bool:
-            ratio, kl = ratio_and_kl(self.actor, batch)
-            improved = float(policy_loss(ratio, batch, multiplier)) <= before
-            return improved and float(kl) <= config.target_kl
+            reward, cost, kl = region.surrogates()
+            return float(loss(reward, cost)) <= before and float(kl) <= config.target_kl
 
         search = line_search(self.actor, step, accept, config)
         return {

@@ -2,9 +2,10 @@
 
 A certificate is an energy function phi with its parameters and its unit of length; what is safe is
 {phi <= 0}, and what an action must keep is `Certificate.constraint`. Formulas stand in
-`safemr.certificates.energy` only; a family says how its parameters are read and applied. The
-paper's own, phi of zeta = [sigma, k, n], is `EnergyCertificate`; another one is a subclass that
-names its family, in the file of the algorithm that trains it:
+`safemr.certificates.energy` only; a family says how its parameters are read and applied. A phi of
+named parameters alone, the paper's of zeta = [sigma, k, n] or one of another package
+(`safemr.certificates.families`), is `EnergyCertificate`; another kind is a subclass that names its
+family, in the file of the algorithm that trains it:
 
     class MyCertificate(Certificate, family="mine"): ...
 
@@ -21,11 +22,11 @@ from typing import Any, ClassVar, Protocol, Self
 
 from numpy.typing import NDArray
 
-from safemr.certificates import energy
+from safemr.certificates import energy, families
+from safemr.certificates.families import EnergyFamily, Parameters
 from safemr.errors import UserError
 from safemr.files import Arrays
 from safemr.names import unknown
-from safemr.paper import Zeta
 
 NETWORK = "certificate_parameters"  # in a policy file: a network, which the paper's family has not
 
@@ -49,6 +50,8 @@ class Recorded(Protocol):
     def algorithm(self) -> str: ...
     @property
     def hyperparameters(self) -> Mapping[str, Any]: ...
+    @property
+    def interface(self) -> Any: ...
     @property
     def has_policy(self) -> bool: ...
     def policy_arrays(self) -> Arrays: ...
@@ -112,7 +115,7 @@ class Certificate(ABC):
         """
 
     def constraint(self, phi: NDArray[Any], phi_next: NDArray[Any]) -> NDArray[Any]:
-        """g [...] of phi before and after a step, kept where g < 0 (Eq. cstr0)."""
+        """g [...] of phi before and after a decision, kept where g < 0 (Eq. cstr0)."""
         return energy.constraint(phi, phi_next, self.eta)
 
 
@@ -128,23 +131,23 @@ def refuse_other_family(record: Recorded, expected: type[Certificate]) -> None:
 
 @dataclass(frozen=True)
 class EnergyCertificate(Certificate, family="energy"):
-    """The paper's family, phi of zeta = [sigma, k, n] (Eq. sis)."""
+    """phi of named parameters, ``zeta``: [sigma, k, n] (Eq. sis), or those of another family."""
 
     kind: ClassVar[str] = "that of [sigma, k, n] alone"
     arrays: ClassVar[tuple[str, ...]] = ("zeta", "length_scale")
 
     name: str
-    zeta: Zeta
+    zeta: Parameters
     eta: float = 0.0
     length_scale: float = 1.0
     record: Recorded | None = None
 
     @classmethod
     def from_record(cls, record: Recorded) -> Self:
-        """With the last logged sigma, k and n, or those of the policy file where none are logged.
+        """With the last logged parameters, or those of the policy file where none are logged.
 
-        Raises UserError where the record has no energy function, or one that is more than these
-        three: who read them alone would measure another function.
+        Raises UserError where the record has no energy function, or one that is more than its
+        parameters: who read them alone would measure another function.
         """
         arrays = record.policy_arrays() if record.has_policy else {}
         family = record.certificate_family()
@@ -157,16 +160,29 @@ class EnergyCertificate(Certificate, family="energy"):
             )
         last = record.rows[-1]
         scale = record.hyperparameters.get("length_scale", arrays.get("length_scale", 1.0))
-        if last.keys() >= set(Zeta._fields):
-            zeta = [last[name] for name in Zeta._fields]
+        parametric = families.named(str(record.hyperparameters.get("family", "paper")))
+        names = parametric.names
+        if last.keys() >= set(names):
+            zeta = [last[name] for name in names]
         elif "zeta" in arrays:
             zeta = arrays["zeta"].astype(float).tolist()
         else:
-            raise UserError(
-                f"{record.folder}: neither its progress nor its policy says sigma, k and n"
-            )
+            listing = " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+            raise UserError(f"{record.folder}: neither its progress nor its policy says {listing}")
         eta = float(record.hyperparameters.get("eta", 0.0))
-        return cls(record.name, Zeta(*zeta), eta, float(scale), record)
+        return cls(record.name, parametric.at(zeta), eta, float(scale), record)
+
+    @property
+    def energy_family(self) -> EnergyFamily:
+        """Whose parameters ``zeta`` are."""
+        return families.family_of(self.zeta)
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """What measurements depend on: ``zeta`` and, of another family than the paper's, that."""
+        named = {"family": self.energy_family.name, "version": self.energy_family.version}
+        papers = self.energy_family is families.PAPER
+        return {"zeta": list(self.zeta), **({} if papers else {"family": named})}
 
     @property
     def parameters(self) -> Mapping[str, float]:
@@ -180,12 +196,12 @@ class EnergyCertificate(Certificate, family="energy"):
         observations: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
         lengths = energy.scaled(d, d_dot, d_min, self.length_scale)
-        return energy.largest(energy.energy(*lengths, *self.zeta))
+        return energy.largest(families.phi_at(*lengths, self.zeta))
 
     def in_metres(self) -> EnergyCertificate:
         """The certificate of the same unsafe set and constraint with ``length_scale`` 1."""
         if self.length_scale == 1.0:
             return self
-        zeta = Zeta(*energy.in_metres(self.zeta, self.length_scale))
-        eta = self.eta * self.length_scale**self.zeta.n
-        return replace(self, zeta=zeta, eta=eta, length_scale=1.0)
+        zeta, factor = self.energy_family.in_metres(self.zeta, self.length_scale)
+        eta = self.eta * factor
+        return replace(self, zeta=self.energy_family.at(zeta), eta=eta, length_scale=1.0)

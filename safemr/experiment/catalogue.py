@@ -1,4 +1,9 @@
-"""What there is to choose from: the algorithms in `safemr.algorithms`, their hyperparameters."""
+"""What there is to choose from: algorithms, those here and those of other packages, and their
+hyperparameters.
+
+One here is a file of `safemr.algorithms`, by its name; how one of another package is named,
+`safemr.packages` says. Both keep to the same contract (`load_algorithm`).
+"""
 
 from __future__ import annotations
 
@@ -7,31 +12,30 @@ import contextlib
 import dataclasses
 import functools
 import importlib
-import importlib.util
 import math
 import pkgutil
 import types
 import typing
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+from safemr import packages
 from safemr.certificates.certificate import FAMILIES as CERTIFICATES
 from safemr.certificates.certificate import Certificate, family_named
 from safemr.environments import register_tasks
 from safemr.errors import UserError, show
 from safemr.experiment.config import FAMILIES, Variant
 from safemr.experiment.roles import BASELINE, LEARNABLE, NOTHING, OUTSIDE, ROLES, Variants
-from safemr.learning.hyperparameters import unused
-from safemr.names import unknown
+from safemr.learning.hyperparameters import resolved, unused
+from safemr.names import nearest, unknown
 
 
 @dataclass(frozen=True)
 class Algorithm:
-    """What a module of `safemr.algorithms` says about itself."""
+    """What the module of an algorithm says about itself."""
 
-    name: str
+    name: str  # of a file here, or the dotted one of another package's module
     version: int
     family: str
     hyperparameters: type[Any]  # the frozen dataclass ``Config``
@@ -39,6 +43,11 @@ class Algorithm:
     certificate: str | None  # the family of its energy functions, None without any
     role: str = BASELINE  # what its variants are where the configuration does not say
     learns: str = NOTHING  # of its energy function
+
+    @property
+    def package(self) -> str | None:
+        """The other package that it comes from."""
+        return packages.package_of(self.name) if packages.is_outside(self.name) else None
 
     @property
     def settable(self) -> set[str]:
@@ -53,15 +62,37 @@ def algorithm_names() -> list[str]:
     return sorted(module.name for module in pkgutil.iter_modules(package.__path__))
 
 
+def full_name(name: str, where: str = "") -> str:
+    """The name under which a record knows an algorithm. Raises UserError where there is none."""
+    name = name.removeprefix(f"{packages.ALGORITHMS}.")
+    if name in algorithm_names() or packages.is_outside(name):
+        return name
+    registered = packages.registered(packages.ALGORITHMS)
+    if name in registered:
+        return registered[name]
+    known = [*algorithm_names(), *registered]
+    error = unknown("algorithm", name, known, where)
+    if nearest(name, known):
+        raise error
+    raise UserError(f"{error}; one of yours is named by its module, PACKAGE.MODULE")
+
+
 @functools.cache
 def load_algorithm(name: str, where: str = "") -> Algorithm:
-    """Import an algorithm by name and check the module's contract."""
-    if name not in algorithm_names():
-        raise unknown("algorithm", name, algorithm_names(), where)
-    file, module = f"safemr/algorithms/{name}.py", _imported(name)
+    """Import an algorithm by name and check the module's contract.
+
+    Raises:
+        UserError: there is none of that name, or its module breaks the contract; naming both.
+    """
+    name = full_name(name, where)
+    file, module = _file(name), _imported(name, where)
     for part in ("VERSION", "Config", "Trainer"):
         if not hasattr(module, part):
             raise UserError(f"{file} must define {part}")
+    if type(module.VERSION) is not int or module.VERSION < 1:
+        raise UserError(f"{file}: VERSION must be an integer from 1 on, not {show(module.VERSION)}")
+    if not hasattr(module.Config, "__dataclass_fields__"):
+        raise UserError(f"{file}: Config must be a dataclass, @dataclass(frozen=True)")
     family = getattr(module.Trainer, "family", None)
     if family not in FAMILIES:
         raise UserError(f"{file}: Trainer.family must be one of {', '.join(FAMILIES)}")
@@ -83,9 +114,19 @@ def load_algorithm(name: str, where: str = "") -> Algorithm:
     )
 
 
-def _imported(name: str) -> Any:
-    """The module of an algorithm that exists."""
+def _file(name: str) -> str:
+    """What an error calls the source of an algorithm."""
+    return name if packages.is_outside(name) else f"safemr/algorithms/{name}.py"
+
+
+def _imported(name: str, where: str = "") -> Any:
+    """The module of an algorithm by its full name."""
     register_tasks()  # an algorithm may import from that package
+    if packages.is_outside(name):
+        try:
+            return packages.imported(name)
+        except UserError as error:
+            raise UserError(f"{where}: {error}" if where else str(error)) from error
     try:
         return importlib.import_module(f"safemr.algorithms.{name}")
     except Exception as error:  # whatever is wrong in that file, its author wants to know where
@@ -102,13 +143,15 @@ def declared_certificate(name: str) -> str | None:
     It is read, not imported: readers of records and a dry run need no torch for it. Raises
     UserError for an unknown algorithm.
     """
-    if name not in algorithm_names():
-        raise unknown("algorithm", name, algorithm_names())
-    spec = importlib.util.find_spec(f"safemr.algorithms.{name}")
-    if spec is None or spec.origin is None:
+    name = full_name(name)
+    outside = packages.is_outside(name)
+    source = packages.origin(name if outside else f"{packages.ALGORITHMS}.{name}")
+    if source is None:
+        if outside:
+            packages.imported(name)  # which says what is missing
         return None
     with contextlib.suppress(SyntaxError):  # importing it says more of what is wrong
-        for node in ast.parse(Path(spec.origin).read_text(encoding="utf-8")).body:
+        for node in ast.parse(source.read_text(encoding="utf-8")).body:
             if (
                 isinstance(node, ast.Assign)
                 and ast.unparse(node.targets[0]) == "CERTIFICATE"
@@ -119,16 +162,18 @@ def declared_certificate(name: str) -> str | None:
     return None
 
 
-def certificate_family(name: str) -> type[Certificate]:
+def certificate_family(name: str, algorithm: str = "") -> type[Certificate]:
     """The class of a family, which an algorithm that declares it makes known when imported.
 
-    Raises UserError for one that there is not.
+    algorithm: one that declares it, where that is known; it may be another package's.
+    Raises UserError for a family that there is not.
     """
-    for algorithm in algorithm_names():
+    theirs = [algorithm] if packages.is_outside(algorithm) else []
+    for each in (*theirs, *algorithm_names()):
         if name in CERTIFICATES:
             break
-        if declared_certificate(algorithm) == name:
-            _imported(algorithm)
+        if declared_certificate(each) == name:
+            _imported(each)
     return family_named(name)
 
 
@@ -159,7 +204,7 @@ def hyperparameters(
         complete = algorithm.hyperparameters(**values)
     except (UserError, ValueError) as error:
         raise UserError(f"{where}: {error}") from error
-    return dataclasses.asdict(complete)
+    return resolved(complete)
 
 
 def _not_settable(name: str, algorithm: Algorithm, where: str) -> UserError:

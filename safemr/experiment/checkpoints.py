@@ -29,7 +29,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from safemr import files
+from safemr import files, packages
 from safemr.errors import UserError, tell
 from safemr.experiment import provenance, records
 from safemr.experiment.locks import ProcessLock
@@ -117,6 +117,14 @@ def read_attempts(work: Path) -> list[dict[str, Any]]:
     return events
 
 
+def _outside(algorithm: Mapping[str, Any]) -> dict[str, Any]:
+    """Where an algorithm and its family of energy functions come from, if from other packages."""
+    family = str(algorithm.get("hyperparameters", {}).get("family", ""))
+    found = {"algorithm": algorithm["name"]} if "package" in algorithm else {}
+    found |= {"family": family} if packages.is_outside(family) else {}
+    return {part: packages.provenance(name) for part, name in found.items()}
+
+
 class RunSession(contextlib.AbstractContextManager["RunSession"]):
     """The life of one training run across interruptions.
 
@@ -165,6 +173,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
         self._earlier = {"wall_s": 0.0, "cpu_s": 0.0}
         self._started = time.monotonic()
         self._due = self._started + minimum_interval
+        self._outside = _outside(config["algorithm"])  # before it is imported and edited meanwhile
         self._costs: list[float] = []  # seconds of each checkpoint written
         self._saved = 0  # the step of the last checkpoint
 
@@ -205,7 +214,7 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
                 tell(f"warning: starting again from step 0: {error}")
         self._saved = self._step()
         started = {"started": provenance.now(), "step": self._saved}
-        self._note({**started, **provenance.source_revision()})
+        self._note({**started, **provenance.source_revision(), **self._outside})
         self._signals.defer()
         return content["state"] if content else None
 
@@ -247,11 +256,18 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
             tell(f"stopped by {reason} at step {step}; the same command continues {here}")
             raise SystemExit(128 + (self._signals.received or signal.SIGTERM))
 
-    def finish(self, policy: Mapping[str, np.ndarray] | None) -> None:
-        """Write the record, provenance last, and remove everything unfinished."""
+    def finish(
+        self, policy: Mapping[str, np.ndarray] | None, notes: Mapping[str, Any] | None = None
+    ) -> None:
+        """Write the record, provenance last, and remove everything unfinished.
+
+        notes: what else the provenance says.
+        """
         attempts = read_attempts(self.work)
         origin = {
             **provenance.collect(),
+            **self._outside,
+            **(notes or {}),
             **{name: round(value, 3) for name, value in self.elapsed().items()},
             "started": next((e["started"] for e in attempts if "started" in e), None),
             "finished": provenance.now(),

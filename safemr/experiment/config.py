@@ -17,8 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, EVALUATION_SEED, UNSEEN_SEED
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, evaluation_seed, unseen_seed
 from safemr.errors import UserError, show
+from safemr.experiment.filter_entries import Filters, read_filters
 from safemr.experiment.roles import ROLES
 from safemr.experiment.sections import (
     LARGEST_SEED,
@@ -34,7 +35,9 @@ from safemr.experiment.sections import (
     seeds_in,
 )
 from safemr.experiment.strict_yaml import read_yaml, typed
+from safemr.experiment.task_entries import ForeignTask
 from safemr.files import REPOSITORY
+from safemr.learning.interface import Interface
 from safemr.names import unknown
 
 FAMILIES = ("off_policy", "on_policy")
@@ -83,6 +86,7 @@ class TaskOverrides:
     settings: Mapping[str, Any]
     budget: Mapping[str, int]
     hyperparameters: Mapping[str, Mapping[str, Any]]
+    interface: Interface | None  # None: that of `tasks`
 
 
 @dataclass(frozen=True)
@@ -132,12 +136,14 @@ class Config:
     """A validated configuration; see config/config.yaml for the meaning of each key."""
 
     tasks: tuple[str, ...]
-    task_variants: Mapping[str, TaskVariant]  # of those tasks that are not registered ones
+    # of those tasks that are not registered ones
+    task_variants: Mapping[str, TaskVariant | ForeignTask]
     algorithms: Mapping[str, Variant]
     seeds: tuple[int, ...]
     budget: Mapping[str, int]
     log_points: int
     evaluation: Evaluation
+    interface: Interface  # how learners meet the tasks of `tasks`, where nothing else is said
     unseen_layouts: UnseenLayouts | None
     task_overrides: Mapping[str, TaskOverrides]
     sensitivity: Sensitivity | None
@@ -150,6 +156,7 @@ class Config:
     wandb_project: str
     cost_tolerance: float
     zero_violation_share: float
+    filters: Filters | None
 
 
 def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None) -> Config:
@@ -174,6 +181,8 @@ def parse(raw: Any) -> Config:
     wandb = Section(top.get("wandb", {}), "wandb", ("mode", "project"))
     safe = Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
     tasks = _tasks(top.required("tasks"), "tasks")
+    seeds = seeds_in(top.required("seeds"), "seeds")
+    least = min(seeds)  # decides whose layouts those are that are not named
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
         raise unknown("wandb mode", mode, WANDB_MODES)
@@ -181,15 +190,18 @@ def parse(raw: Any) -> Config:
         tasks=tuple(tasks),
         task_variants={name: variant for name, variant in tasks.items() if variant},
         algorithms=_variants(top.required("algorithms"), "algorithms"),
-        seeds=seeds_in(top.required("seeds"), "seeds"),
+        seeds=seeds,
         budget=_budget(top.required("budget"), "budget"),
         log_points=integer(top.get("log_points", 50), "log_points", 1),
         evaluation=Evaluation(
             integer(evaluation.required("points"), "evaluation.points", 1),
             integer(evaluation.required("episodes"), "evaluation.episodes", 1),
-            integer(evaluation.get("seed", EVALUATION_SEED), "evaluation.seed", 0, LARGEST_SEED),
+            integer(
+                evaluation.get("seed", evaluation_seed(least)), "evaluation.seed", 0, LARGEST_SEED
+            ),
         ),
-        unseen_layouts=_unseen(top.get("unseen_layouts")),
+        interface=Interface.read(top.get("interface")),
+        unseen_layouts=_unseen(top.get("unseen_layouts"), least),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
             for name, value in labelled(top.get("task_overrides", {}), "task_overrides")
@@ -211,6 +223,7 @@ def parse(raw: Any) -> Config:
         zero_violation_share=number(
             safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
+        filters=read_filters(top.get("filters"), top.required("algorithms"), tasks, seeds),
     )
     if config.log_points % config.evaluation.points:
         raise UserError(
@@ -226,8 +239,9 @@ def parse(raw: Any) -> Config:
 
 
 _TOP_LEVEL = (
-    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "task_overrides"),
+    *("tasks", "algorithms", "seeds", "budget", "log_points", "evaluation", "interface"),
     *(
+        "task_overrides",
         "unseen_layouts",
         "sensitivity",
         "aircraft",
@@ -236,15 +250,16 @@ _TOP_LEVEL = (
         "figures_root",
         "allow_missing",
     ),
-    *("wandb", "safe"),
+    *("wandb", "safe", "filters"),
 )
 
 
-def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
+def _tasks(value: Any, where: str) -> dict[str, TaskVariant | ForeignTask | None]:
     """Names of tasks, and what each is where it is no registered one.
 
-    A list of names, in which ``{name: {base, settings}}`` is a task with other settings, or one
-    mapping of all names, those of registered tasks with nothing behind them.
+    A list of names, in which ``{name: {base, settings}}`` is a task with other settings and
+    ``{name: {id, ...}}`` one from outside, or one mapping of all names, those of registered tasks
+    with nothing behind them.
     """
     parts = [value] if isinstance(value, Mapping) and value else listed(value, where)
     entries = [
@@ -260,9 +275,11 @@ def _tasks(value: Any, where: str) -> dict[str, TaskVariant | None]:
     }
 
 
-def _task_variant(value: Any, where: str) -> TaskVariant | None:
+def _task_variant(value: Any, where: str) -> TaskVariant | ForeignTask | None:
     if value is None or value == {}:
         return None
+    if isinstance(value, Mapping) and "id" in value:
+        return ForeignTask.read(value, where)
     section = Section(value, where, ("base", "settings"))
     return TaskVariant(
         checked_name(section.required("base"), f"{where}.base"),
@@ -294,7 +311,7 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
 
 
 def _task_overrides(value: Any, where: str) -> TaskOverrides:
-    section = Section(value, where, ("settings", "budget", "hyperparameters"))
+    section = Section(value, where, ("settings", "budget", "hyperparameters", "interface"))
     families = Section(section.get("hyperparameters", {}), f"{where}.hyperparameters", FAMILIES)
     return TaskOverrides(
         mapping(section.get("settings", {}), f"{where}.settings"),
@@ -303,16 +320,19 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
             family: mapping(values, f"{where}.hyperparameters.{family}")
             for family, values in families.value.items()
         },
+        Interface.read(section.value["interface"], f"{where}.interface")
+        if "interface" in section.value
+        else None,
     )
 
 
-def _unseen(value: Any) -> UnseenLayouts | None:
+def _unseen(value: Any, least: int) -> UnseenLayouts | None:
     if not value and (value is None or isinstance(value, Mapping)):
         return None
     section = Section(value, "unseen_layouts", ("episodes", "seed"))
     return UnseenLayouts(
         integer(section.required("episodes"), "unseen_layouts.episodes", 1),
-        integer(section.get("seed", UNSEEN_SEED), "unseen_layouts.seed", 0, LARGEST_SEED),
+        integer(section.get("seed", unseen_seed(least)), "unseen_layouts.seed", 0, LARGEST_SEED),
     )
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from safemr.experiment.planning import Run
 from safemr.experiment.record import Record
 from safemr.experiment.records import RecordError
-from safemr.tasks import name_of
+from safemr.tasks import Described, is_foreign, name_of
 
 
 class Cost(NamedTuple):
@@ -47,6 +47,17 @@ def announced(root: Path, runs: Sequence[Run]) -> list[str]:
     return lines
 
 
+def left_out(tasks: Mapping[str, Described]) -> list[str]:
+    """Lines about what is not made for tasks whose environment cannot tell it."""
+    without = [name for name, task in tasks.items() if is_foreign(task.entry)]
+    if not without:
+        return []
+    return [
+        f"{', '.join(without)}: curves, tables, claims and reports; no check of certificates, "
+        "which asks for a model of the robot, and no trajectories, which ask for a scene to draw"
+    ]
+
+
 def _opened(folder: Path) -> Record | None:
     try:
         return Record.open(folder)
@@ -64,7 +75,10 @@ def _costs(recorded: Iterable[Record]) -> Iterator[Cost]:
 
 
 def _estimate(run: Run, known: Sequence[Cost]) -> float | None:
-    """CPU seconds of a run: the mean a step of the most similar algorithm recorded on its task."""
+    """CPU seconds of a run: the mean a step of the most similar algorithm recorded on its task.
+
+    All runs of a plan meet a task through one interface, so a decision takes as many steps.
+    """
     algorithm = run.config["algorithm"]
     names = set(algorithm["hyperparameters"])
 

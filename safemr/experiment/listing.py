@@ -17,6 +17,7 @@ import typing
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from safemr import packages
 from safemr.errors import tell
 from safemr.experiment.catalogue import Algorithm, algorithm_names, load_algorithm
 from safemr.learning.hyperparameters import meanings, unused
@@ -49,6 +50,8 @@ def overview() -> Iterator[str]:
     width = max(len(algorithm.name) for algorithm in algorithms)
     for algorithm in algorithms:
         yield f"  {algorithm.name:{width}}  {algorithm.family:10}  {summary(algorithm)}"
+    for name, module in sorted(packages.registered(packages.ALGORITHMS).items()):
+        yield f"  {name:{width}}  of another package: {module}"
     yield ""
     yield "Hyperparameters: safemr list ALGORITHM, or --all"
 

@@ -12,11 +12,12 @@ import hashlib
 import json
 from typing import Any
 
-from safemr import files
+from safemr import files, packages
 from safemr import tasks as tasks_of
 from safemr.experiment import planning
 from safemr.experiment.config import Config
 from safemr.experiment.roles import Variants
+from safemr.experiment.task_entries import ForeignTask
 from safemr.files import REPOSITORY
 
 
@@ -49,7 +50,30 @@ def _key(config: Config) -> str:
     for package in ("envs", "safemr"):
         for source in sorted((REPOSITORY / package).rglob("*.py")):
             digest.update(source.relative_to(REPOSITORY).as_posix().encode() + source.read_bytes())
+    for module in _modules(config):
+        digest.update(f"{module}:{packages.digest(module)}".encode())
     return digest.hexdigest()
+
+
+def _modules(config: Config) -> list[str]:
+    """The modules of other packages that a configuration names: algorithms, energies, tasks."""
+    parts = (config.algorithms, config.aircraft.algorithms if config.aircraft else {})
+    variants = [variant for part in parts for variant in part.values()]
+    chosen = [variant.overrides for variant in variants]
+    for overrides in config.task_overrides.values():
+        chosen += overrides.hyperparameters.values()
+    named = {
+        packages.ALGORITHMS: {variant.algorithm for variant in variants},
+        packages.CERTIFICATES: {str(each["family"]) for each in chosen if "family" in each},
+    }
+    modules = {
+        packages.registered(group).get(name, name) if "." not in name else name
+        for group, names in named.items()
+        for name in names
+    }
+    tasks = [task for task in config.task_variants.values() if isinstance(task, ForeignTask)]
+    registering = {task.id.rpartition(":")[0] for task in tasks} - {""}
+    return sorted({*filter(packages.is_outside, modules), *registering})
 
 
 def _from_json(saved: dict[str, Any]) -> planning.Plan:

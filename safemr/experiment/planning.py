@@ -8,33 +8,31 @@ numbers changes the digest, and with it the folder of the record.
 from __future__ import annotations
 
 import functools
-import importlib
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr import environments, paper
-from safemr.errors import UserError, show
+from safemr import paper
+from safemr.errors import UserError
 from safemr.experiment import records
 from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorithm, variants_of
 from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
 from safemr.experiment.roles import Variants
+from safemr.experiment.task_entries import ForeignTask as ForeignTask
+from safemr.experiment.task_entries import check_name as check_name
+from safemr.experiment.task_entries import describe_foreign as describe_foreign
+from safemr.experiment.task_entries import describe_task as describe_task
+from safemr.experiment.task_entries import described as described
+from safemr.experiment.task_entries import fitted_interface as fitted_interface
+from safemr.experiment.task_entries import installed as installed
+from safemr.experiment.task_entries import is_id as is_id
+from safemr.experiment.task_entries import task_names as task_names
 from safemr.learning.hyperparameters import Setting
+from safemr.learning.interface import Interface
 from safemr.names import unknown
-from safemr.tasks import (
-    Described,
-    Traits,
-    base_of,
-    make_envs,
-    name_of,
-    settings_of,
-    task_settings,
-    traits,
-)
-from safemr.tasks import Task as TaskOrName
+from safemr.tasks import OPTIONS, Described, base_of, settings_of, task_settings
 
 
 @dataclass(frozen=True)
@@ -91,108 +89,31 @@ class Plan:
         return (*self.trained, *self.outside)
 
 
-@functools.cache
-def task_names() -> list[str]:
-    """The tasks that the environment package registers, by their names without ``-v0``."""
-    gymnasium = importlib.import_module("gymnasium")
-    environments.register_tasks()
-
-    def ours(entry_point: Any) -> bool:
-        module = entry_point if isinstance(entry_point, str) else entry_point.__module__
-        return module.partition(":")[0].partition(".")[0] == environments.PACKAGE
-
-    specs = gymnasium.registry.values()
-    return sorted(spec.id.removesuffix("-v0") for spec in specs if ours(spec.entry_point))
-
-
-@functools.cache
-def _task_version(name: str, settings_json: str) -> int:
-    gymnasium = importlib.import_module("gymnasium")
-    settings = json.loads(settings_json)
-    known = gymnasium.make(f"{name}-v0", disable_env_checker=True).unwrapped.setting_names
-    for setting in settings:  # before Gymnasium sees them: it has keywords of its own, as `task`
-        if setting not in known:
-            raise unknown("setting", setting, known, f"task {name}")
-        if settings[setting] is None:
-            raise UserError(f"task {name}: the setting {setting} has no value; leave it out")
-    try:  # a batch, since that is what learners train on
-        environment: Any = make_envs({"name": name, "settings": settings}, 1)
-    except Exception as error:  # the environment's own validation, whatever its type
-        reason = str(error).partition(chr(10))[0].removeprefix(f"{name}: ")
-        raise UserError(f"task {name}: {reason}") from error
-    version = int(environment.task_version)
-    environment.close()
-    return version
-
-
-def describe_task(
-    name: str, settings: Mapping[str, Any], where: str = "", *, base: str | None = None
-) -> dict[str, Any]:
-    """The ``task`` entry of a run's config: name, version and settings.
-
-    base: the registered task of which ``name`` is a variant; then the entry says it, too.
-    """
-    registered = name if base is None else base
-    if registered not in task_names():
-        raise unknown("task", registered, task_names(), where)
-    if base is not None and name.lower() in (known.lower() for known in task_names()):
-        raise UserError(f"{name!r} is the name of a registered task; give {where} another one")
-    try:
-        text = records.canonical_json(settings)
-    except (TypeError, ValueError) as error:
-        raise UserError(f"settings of task {name}: {error}") from error
-    entry = {"name": name, "version": _task_version(registered, text), "settings": dict(settings)}
-    return entry if base is None else {**entry, "base": base}
-
-
-def installed(task: TaskOrName) -> dict[str, Any]:
-    """The entry of a task as the installed environments have it: what a new run would say."""
-    base = None if name_of(task) == base_of(task) else base_of(task)
-    return describe_task(name_of(task), settings_of(task), base=base)
-
-
-def described(entry: Mapping[str, Any]) -> Described:
-    """A task's entry with the traits of its environment."""
-    return Described(entry, _traits(records.canonical_json(entry)))
-
-
-@functools.cache
-def _traits(entry_json: str) -> Traits:
-    envs = make_envs(json.loads(entry_json), 1)  # the batched one, which is what runs are made of
-    found = traits(envs)
-    envs.close()
-    return found
-
-
-def check_name(entry: Mapping[str, Any], where: str, remedy: str) -> None:
-    """A registered task under its own name has its own settings, the simulation's apart.
-
-    Raises:
-        UserError: naming ``where`` and the setting that makes another task of it.
-    """
-    changed = task_settings(entry["settings"])
-    if "base" not in entry and changed:
-        name, value = next(iter(changed.items()))
-        raise UserError(
-            f"{where}: {name} = {show(value)} makes another task of {entry['name']}, which needs a "
-            f"name of its own: {remedy}"
-        )
-
-
 def check_setting(
-    algorithm: Algorithm, values: Mapping[str, Any], task: Mapping[str, Any], steps: int, where: str
+    algorithm: Algorithm,
+    values: Mapping[str, Any],
+    task: Mapping[str, Any],
+    steps: int,
+    where: str,
+    action_repeat: int = 1,
 ) -> None:
     """Refuse hyperparameters that cannot work on a task, as `describe_task` gives it, in a budget.
 
     Raises:
         UserError: it names the hyperparameter, and what it may be there.
     """
+    if algorithm.certificate is not None and not described(task).traits.distances:
+        raise UserError(
+            f"{where} on {task['name']}: {algorithm.name} has an energy function, and the "
+            "environment reports no d and d_dot; report them (safemr check "
+            f"{task.get('id', '')}), or choose an algorithm without one"
+        )
     check = getattr(algorithm.hyperparameters(**values), "check_setting", None)
     if check is None:  # an algorithm that does without `safemr.learning.hyperparameters`
         return
     try:
         has = described(task).traits
-        check(Setting(has.action_dim, has.episode_steps or steps, steps))
+        check(Setting(has.action_dim, has.episode_steps or steps, steps, action_repeat))
     except UserError as error:
         raise UserError(f"{where} on {task['name']}: {error}") from error
 
@@ -207,10 +128,14 @@ def make_run(
     steps: int,
     log_every: int,
     evaluation: Mapping[str, int],
+    interface: Interface | None = None,
 ) -> Run:
-    """A run from its parts: `describe_task`, `load_algorithm` and `hyperparameters`."""
+    """A run from its parts: `describe_task`, `load_algorithm`, `hyperparameters`, and
+    `fitted_interface` where the learner does not meet the environment as it is."""
     described = {"name": algorithm.name, "version": algorithm.version, "hyperparameters": values}
-    return _run(task, described, variant, seed, steps, log_every, evaluation)
+    if algorithm.package is not None:
+        described["package"] = algorithm.package
+    return _run(task, described, variant, seed, steps, log_every, evaluation, interface)
 
 
 def _run(
@@ -221,6 +146,7 @@ def _run(
     steps: int,
     log_every: int,
     evaluation: Mapping[str, int],
+    interface: Interface | None = None,
 ) -> Run:
     config = {
         "schema": records.SCHEMA,
@@ -231,6 +157,8 @@ def _run(
         "log_every": log_every,
         "evaluation": dict(evaluation),
     }
+    if interface is not None and interface.entry():
+        config["interface"] = interface.entry()
     try:
         records.canonical_json(config)
     except (TypeError, ValueError) as error:
@@ -310,7 +238,7 @@ class _Resolver:
         for task in config.task_variants:
             self._task(task, f"tasks.{task}")
         for task, overrides in config.task_overrides.items():
-            self._task(task, "task_overrides")
+            self._interface(task, self._task(task, "task_overrides"))
             for family, values in overrides.hyperparameters.items():
                 names = {
                     name
@@ -332,6 +260,7 @@ class _Resolver:
     ) -> Iterator[Run]:
         described = self._task(task, task_section)
         overrides = self.config.task_overrides.get(task)
+        interface = self._interface(task, described)
         for label, variant in variants.items():
             algorithm = load_algorithm(variant.algorithm)
             shared = overrides.hyperparameters.get(algorithm.family, {}) if overrides else {}
@@ -340,7 +269,8 @@ class _Resolver:
             chosen = {k: v for k, v in shared.items() if k in names} | dict(variant.overrides)
             values = hyperparameters(algorithm, chosen, f"{section}.{label}")
             steps = self._steps(task, algorithm.family)
-            check_setting(algorithm, values, described, steps, f"{section}.{label}")
+            where = f"{section}.{label}"
+            check_setting(algorithm, values, described, steps, where, interface.action_repeat)
             for seed in seeds:
                 yield make_run(
                     described,
@@ -349,6 +279,7 @@ class _Resolver:
                     variant=label,
                     seed=seed,
                     steps=steps,
+                    interface=interface,
                     **self._schedule(steps),
                 )
 
@@ -371,6 +302,7 @@ class _Resolver:
     def outside(self) -> Iterator[Run]:
         for task in self.config.tasks:
             described = self._task(task, "tasks")
+            interface = self._interface(task, described)
             for label, entry in self.config.outside.items():
                 algorithm = {
                     "name": entry.algorithm,
@@ -378,8 +310,19 @@ class _Resolver:
                     "hyperparameters": dict(entry.hyperparameters),
                 }
                 for seed in self.config.seeds:
-                    schedule = self._schedule(entry.steps)
+                    schedule = self._schedule(entry.steps) | {"interface": interface}
                     yield _run(described, algorithm, label, seed, entry.steps, **schedule)
+
+    def _interface(self, task: str, described: Mapping[str, Any]) -> Interface:
+        """How learners meet a task: what the configuration says for it, or for all of `tasks`."""
+        overrides = self.config.task_overrides.get(task)
+        if overrides is not None and overrides.interface is not None:
+            asked, where = overrides.interface, f"task_overrides.{task}.interface"
+        else:  # the aircraft is met as it is
+            part = self.config.sensitivity
+            shared = task in self.config.tasks or (part is not None and task == part.task)
+            asked, where = self.config.interface if shared else Interface(), "interface"
+        return fitted_interface(asked, described, where)
 
     def _task(self, name: str, section: str) -> dict[str, Any]:
         """The entry of a task by its name in the configuration."""
@@ -397,6 +340,10 @@ class _Resolver:
             check_name(entry, f"task_overrides.{name}.settings", remedy)
             return entry
         where = f"tasks.{name}"
+        if isinstance(variant, ForeignTask):
+            if given:
+                raise UserError(f"task_overrides.{name}.settings belong into {where}.settings")
+            return describe_foreign(name, variant, where)
         if not variant.settings:
             raise UserError(f"{where}.settings is empty: then it is {variant.base} itself")
         describe_task(variant.base, variant.settings, where)
@@ -437,6 +384,7 @@ def _check_distinct(plan: Plan) -> None:
             )
     names: dict[str, str] = {}
     for name, task in plan.tasks.items():
-        same = records.canonical_json([base_of(task.entry), settings_of(task.entry)])
+        options = [task.entry.get(option) for option in OPTIONS]
+        same = records.canonical_json([base_of(task.entry), settings_of(task.entry), options])
         if names.setdefault(same, name) != name:
             raise UserError(f"{names[same]!r} and {name!r} are the same task; remove one")

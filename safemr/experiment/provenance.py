@@ -56,6 +56,14 @@ def package_versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in PACKAGES}
 
 
+def distribution_of(module: str) -> dict[str, str | None]:
+    """The package that a module of others belongs to, and its version where it is installed."""
+    package = module.partition(".")[0]
+    names = metadata.packages_distributions().get(package, ())
+    version = metadata.version(names[0]) if names else None
+    return {"package": names[0] if names else package, "version": version}
+
+
 def cpu_model() -> str:
     """The processor's marketing name where the system tells it."""
     try:

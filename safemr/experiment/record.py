@@ -12,6 +12,7 @@ from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.errors import UserError
 from safemr.experiment import records
 from safemr.files import POLICY, Arrays, policy_arrays
+from safemr.learning.interface import Interface
 from safemr.paper import Zeta
 
 if TYPE_CHECKING:
@@ -59,6 +60,11 @@ class Record:
         return self.config["algorithm"].get("hyperparameters", {})
 
     @property
+    def interface(self) -> Interface:
+        """How the learner met its task. Raises UserError where the configuration's is none."""
+        return Interface.read(self.config.get("interface"), f"{self.folder}: interface")
+
+    @property
     def name(self) -> str:
         """The run among others of its task: ``SafeMR (seed 0)``."""
         return f"{self.variant} (seed {self.seed})"
@@ -93,11 +99,13 @@ class Record:
         """The class of its certificate, which its algorithm's file declares.
 
         An outside implementation's record, whose algorithm has no file here, is of the paper's
-        family where it logs sigma, k and n. Raises UserError where there is no certificate.
+        family where it logs sigma, k and n. Raises UserError where there is no certificate, or
+        where the package that has the algorithm is not there.
         """
         from safemr.experiment import catalogue
 
-        if self.algorithm in catalogue.algorithm_names():
+        trained_here = "package" in self.config["algorithm"]  # by a module of another package
+        if trained_here or self.algorithm in catalogue.algorithm_names():
             family = catalogue.declared_certificate(self.algorithm)
         else:
             family = EnergyCertificate.family if self.rows[-1].keys() >= set(Zeta._fields) else None
@@ -106,7 +114,7 @@ class Record:
                 f"{self.folder}: its algorithm, {self.algorithm}, has no energy function and so no "
                 "certificate"
             )
-        return catalogue.certificate_family(family)
+        return catalogue.certificate_family(family, self.algorithm)
 
     def certificate(self) -> Certificate:
         """The certificate that the run ended with. Raises UserError where it has none."""

@@ -9,7 +9,6 @@ the algorithm, this file evaluates, records, checkpoints and resumes; the algori
 from __future__ import annotations
 
 import argparse
-import functools
 import json
 import sys
 import time
@@ -17,15 +16,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from safemr.conventions import EVALUATION_SEED
-from safemr.environments import check_envs
+from safemr.certificates import families
+from safemr.conventions import evaluation_seed
+from safemr.environments import SafetyEnvs, check_envs, exact_resume
 from safemr.errors import UserError, tell
 from safemr.experiment import planning, records
 from safemr.experiment.config import WANDB_MODES
+from safemr.experiment.provenance import distribution_of
 from safemr.experiment.sections import checked_name
 from safemr.experiment.signals import StoppedError, StopSignals
 from safemr.experiment.strict_yaml import assignment
-from safemr.tasks import make_envs
+from safemr.learning.interface import Interface
+from safemr.paper import Zeta
+from safemr.tasks import is_foreign, make_envs
 
 if TYPE_CHECKING:
     from safemr.experiment.checkpoints import RunSession
@@ -34,8 +37,11 @@ if TYPE_CHECKING:
 class Progress:
     """What a person sees: a line per log point, redrawn in place on a terminal."""
 
-    def __init__(self, label: str, steps: int, stream: TextIO) -> None:
+    def __init__(
+        self, label: str, steps: int, stream: TextIO, parameters: Sequence[str] = Zeta._fields
+    ) -> None:
         self._label, self._steps, self._stream = label, steps, stream
+        self._parameters = parameters  # of the energy function, shown where they are logged
 
     def show(self, row: Mapping[str, float]) -> None:
         def number(name: str, form: str = ".2f") -> str:
@@ -46,8 +52,8 @@ class Progress:
         rate = row["time_steps_per_s"]
         left = (self._steps - row["step"]) / rate if rate > 0 else 0.0
         zeta = ""
-        if "sigma" in row:
-            zeta = f" | zeta {number('sigma', '.3f')} {number('k', '.3f')} {number('n', '.3f')}"
+        if all(name in row for name in self._parameters):
+            zeta = " | zeta " + " ".join(number(name, ".3f") for name in self._parameters)
         terminal = self._stream.isatty()
         bar = "#" * round(20 * share)
         line = (
@@ -93,16 +99,21 @@ def train(
             "or resolve the configuration anew"
         )
     steps, log_every, evaluation = config["steps"], config["log_every"], config["evaluation"]
-    environments = functools.partial(make_envs, config["task"])
-    evaluation_envs = environments(evaluation["episodes"])
+    evaluation_envs = make_envs(config["task"], evaluation["episodes"])
     check_envs(evaluation_envs)
+    interface = Interface.read(config.get("interface")).fitted(evaluation_envs)
+
+    def environments(num_envs: int) -> SafetyEnvs:
+        return interface.around(make_envs(config["task"], num_envs))
+
     hyperparameters = algorithm.hyperparameters(**described["hyperparameters"])
     trainer = algorithm.trainer(hyperparameters, environments, config["seed"], steps)
     state = session.resume()
     if state is not None:
         trainer.load_state_dict(state)
         tell(f"{label} continues at step {trainer.step}", stream)
-    progress = Progress(label, steps, stream)
+    family = families.named(described["hyperparameters"].get("family", families.PAPER.name))
+    progress = Progress(label, steps, stream, family.names)
     with WandbLog(config, session, wandb or {}) as wandb_log:
         while trainer.step < steps:
             begun, before = time.perf_counter(), trainer.step
@@ -123,7 +134,10 @@ def train(
             progress.show(row)
             wandb_log.log(row)
             session.maybe_checkpoint(trainer.state_dict)
-    session.finish(trainer.policy.arrays())
+    notes: dict[str, Any] = {} if exact_resume(evaluation_envs) else {"exact_resume": False}
+    if is_foreign(config["task"]):
+        notes["task_package"] = distribution_of(config["task"]["id"].partition(":")[0])
+    session.finish(trainer.policy.arrays(), notes)
 
 
 def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -136,7 +150,11 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     asked = {"-h", "--help"} & set(sys.argv[1:] if argv is None else argv)
     tasks = ", ".join(planning.task_names()) if asked else ""  # imports the simulator
-    parser.add_argument("--task", help=f"one of {tasks}")
+    parser.add_argument(
+        "--task",
+        help=f"one of {tasks}, or Gymnasium's id of an environment from outside, with the package "
+        "that registers it (my_package:MyTask-v0, docs/your-own.md)",
+    )
     parser.add_argument("--task-name", help="what the task is called with settings of its own")
     parser.add_argument("--algorithm", help=f"one of {', '.join(planning.algorithm_names())}")
     parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
@@ -146,11 +164,14 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="override a hyperparameter; task.NAME=VALUE is a setting of the environment",
+        help="override a hyperparameter; task.NAME=VALUE is a setting of the environment, "
+        "interface.NAME=VALUE one of how the learner meets it",
     )
     parser.add_argument("--log-points", type=int, default=20, help="rows of progress.csv")
     parser.add_argument("--eval-episodes", type=int, default=10)
-    parser.add_argument("--eval-seed", type=int, default=EVALUATION_SEED)
+    parser.add_argument(
+        "--eval-seed", type=int, help="first layout (default: that of reported or of tuning seeds)"
+    )
     parser.add_argument(
         "--resolved", help="a run's complete configuration as JSON, or a file of it"
     )
@@ -181,20 +202,31 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         return config, arguments.variant or name
     if not arguments.task or not arguments.algorithm:
         raise UserError("give --task and --algorithm (or --resolved)")
+    if arguments.eval_seed is None:
+        arguments.eval_seed = evaluation_seed(arguments.seed)
     for name in ("seed", "steps", "log_points", "eval_episodes", "eval_seed"):
         if getattr(arguments, name) < (0 if "seed" in name else 1):
             raise UserError(f"--{name.replace('_', '-')} must be positive")
-    overrides = dict(map(assignment, arguments.set))
-    settings = {
-        name.removeprefix("task."): overrides.pop(name)
-        for name in list(overrides)
-        if name.startswith("task.")
-    }
+    overrides: dict[str, Any] = dict(
+        one if isinstance(one, tuple) else assignment(one) for one in arguments.set
+    )
+    settings, asked = (
+        {
+            name.removeprefix(prefix): overrides.pop(name)
+            for name in list(overrides)
+            if name.startswith(prefix)
+        }
+        for prefix in ("task.", "interface.")
+    )
     task = _task(arguments, settings)
+    where = "--set interface"
+    interface = planning.fitted_interface(Interface.read(asked, where), task, where)
     algorithm = planning.load_algorithm(arguments.algorithm, "--algorithm")
     log_every = max(arguments.steps // arguments.log_points, 1)
     values = planning.hyperparameters(algorithm, overrides, "--set")
-    planning.check_setting(algorithm, values, task, arguments.steps, arguments.algorithm)
+    planning.check_setting(
+        algorithm, values, task, arguments.steps, arguments.algorithm, interface.action_repeat
+    )
     run = planning.make_run(
         task,
         algorithm,
@@ -202,6 +234,7 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
         variant=arguments.variant or arguments.algorithm,
         seed=arguments.seed,
         steps=arguments.steps,
+        interface=interface,
         log_every=log_every,
         evaluation={
             "every": log_every,
@@ -214,6 +247,10 @@ def resolve(arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _task(arguments: argparse.Namespace, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The task's entry; settings that make another task of it need a name."""
+    if planning.is_id(arguments.task):
+        foreign = planning.ForeignTask.said(arguments.task, settings, "--task")
+        name = checked_name(arguments.task_name or foreign.name, "--task-name")
+        return planning.describe_foreign(name, foreign, "it with --task-name")
     if arguments.task_name is None:
         task = planning.describe_task(arguments.task, settings, "--task")
         planning.check_name(task, "--set", "give it with --task-name")

@@ -27,7 +27,7 @@ class EpisodeStatistics:
 
     Metrics (means over the episodes finished since the last `pop`; nan when there was none):
     ``return``, ``cost`` (the authors'), ``cost_indicator``, ``cost_contact``, ``goals``,
-    ``reward_approach``, ``reward_push``, ``reward_goal``, ``length`` [steps],
+    ``reward_approach``, ``reward_push``, ``reward_goal``, ``length`` [control steps],
     ``zero_violation_share`` (share of episodes without a single violating step),
     ``violation_rate`` (violating steps / steps) and ``episodes`` (their number).
     """
@@ -50,7 +50,7 @@ class EpisodeStatistics:
         running[0] += rewards
         for row, key in enumerate(_INFO_SUMS.values(), start=1):
             running[row] += info_of(infos, key)
-        running[-1] += 1.0
+        running[-1] += info_of(infos, "control_steps")
         done = terminated | truncated
         if done.any():
             keep = done if counted is None else done & counted
@@ -82,6 +82,10 @@ class EpisodeStatistics:
             "violation_rate": float(violations.sum() / table[:, -1].sum()),
             "episodes": float(len(table)),
         }
+
+    def abandon(self) -> None:
+        """Forgets the running episodes, which nobody will finish."""
+        self._running[:] = 0.0
 
     def state_dict(self) -> dict[str, Any]:
         return {"running": self._running.copy(), "finished": self.finished}

@@ -9,10 +9,14 @@ from numpy.typing import NDArray
 
 from safemr.environments import SafetyEnvs
 from safemr.learning.episode_statistics import EpisodeStatistics
+from safemr.learning.interface import held
 
 
 class Acts(Protocol):
-    """Anything that maps raw observations [N, obs] to actions [N, A]."""
+    """Anything that maps raw observations [N, obs] to the environment's actions [N, A].
+
+    Each is held for ``action_repeat`` control steps, where it says so.
+    """
 
     def act(self, observations: NDArray[Any], deterministic: bool = True) -> NDArray[Any]: ...
 
@@ -24,6 +28,7 @@ def play(
 
     Reusing ``envs`` from one call to the next gives the same layouts each time.
     """
+    envs = held(envs, getattr(policy, "action_repeat", 1))
     statistics = EpisodeStatistics(envs.num_envs)
     running = np.ones(envs.num_envs, bool)
     observations, _ = envs.reset(seed=seed)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from safemr.learning.networks import StackedMLP
+from safemr.learning.rollouts import Batch
 
 
 def log_density(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
@@ -68,3 +69,10 @@ class GaussianActor:
             loss, self.parameters, retain_graph=retain_graph, materialize_grads=True
         )
         return torch.cat(gradients)
+
+
+def ratio_and_kl(actor: GaussianActor, batch: Batch) -> tuple[Tensor, Tensor]:
+    """pi(a|s) / pi_old(a|s), [B], and E_s[KL(pi_old || pi)], both differentiable."""
+    mean = actor.mean(batch.observations)
+    ratio = torch.exp(log_density(batch.actions, mean, actor.log_std) - batch.log_density)
+    return ratio, kl_divergence(batch.mean, batch.log_std, mean, actor.log_std).mean()

@@ -7,7 +7,10 @@ A ``Config`` derives from `Hyperparameters`; it and its mixins may declare, as c
 - ``CHOICES``: field -> the values that it may have;
 - ``UNUSED``: field that is inherited and changes nothing here -> why. It keeps its default, so that
   the resolved hyperparameters and with them the digests of records stay as they are, and setting
-  it is refused (`safemr.experiment.catalogue.hyperparameters`).
+  it is refused (`safemr.experiment.catalogue.hyperparameters`);
+- ``ADDED``: fields that came after runs had been recorded, whose default is what those runs did.
+  Resolved hyperparameters say such a field only where it differs (`resolved`), so that the digests
+  of records stay as they are. The default of such a field must never change.
 
 What a class declares replaces what its parents say of the same field. The meaning of a field is the
 comment behind it or, where there is none, the comment lines directly above it (`meanings`).
@@ -32,7 +35,13 @@ class Setting(NamedTuple):
 
     action_dim: int
     episode_steps: int  # time limit of an episode
-    total_steps: int  # environment steps of the run
+    total_steps: int  # control steps of the run
+    action_repeat: int = 1  # control steps of a decision
+
+    @property
+    def episode_decisions(self) -> int:
+        """The most decisions of an episode."""
+        return -(-self.episode_steps // self.action_repeat)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +51,7 @@ class Hyperparameters:
     RANGES: ClassVar[Mapping[str, str]] = {}
     CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     UNUSED: ClassVar[Mapping[str, str]] = {}
+    ADDED: ClassVar[frozenset[str]] = frozenset()
 
     def __post_init__(self) -> None:
         for name, interval in declared(type(self), "RANGES").items():
@@ -76,6 +86,18 @@ def declared(config: type[Any], what: str) -> dict[str, Any]:
 def unused(config: type[Any]) -> dict[str, str]:
     """Fields that an algorithm inherits and does not use -> why; empty for any other class."""
     return declared(config, "UNUSED")
+
+
+def resolved(config: Any) -> dict[str, Any]:
+    """The fields of an algorithm's ``Config`` as a record says them."""
+    values = dataclasses.asdict(config)
+    added: set[str] = set()
+    for part in type(config).__mro__:
+        added |= vars(part).get("ADDED", frozenset())
+    for field in dataclasses.fields(config):
+        if field.name in added and values[field.name] == field.default:
+            del values[field.name]
+    return values
 
 
 def within(value: float, interval: str) -> bool:

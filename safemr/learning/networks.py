@@ -196,6 +196,14 @@ class StackedMLP:
         twin.follow(self, 1.0)
         return twin
 
+    def member(self, index: int) -> StackedMLP:
+        """A detached copy of one of the networks."""
+        twin = object.__new__(StackedMLP)
+        twin.shape = Shape(1, self.shape.sizes, self.shape.activation)
+        parts = [part[index].reshape(-1) for layer in self._layers for part in layer]
+        twin._hold(torch.cat(parts).detach())
+        return twin
+
     @torch.no_grad()
     def follow(self, source: StackedMLP, rate: float) -> None:
         """Polyak averaging: parameters <- (1 - rate) parameters + rate source's first members."""

@@ -29,17 +29,25 @@ def network(stack: StackedMLP) -> numba_kernels.Network:
     )
 
 
-def optimiser(adam: torch.optim.Adam) -> numba_kernels.Optimiser:
-    """The state of an Adam over one tensor, created as its own first step would do it."""
+def optimisers(adam: torch.optim.Adam) -> list[numba_kernels.Optimiser]:
+    """The state of an Adam for each of its tensors, created as its own first step would do it."""
     (group,) = adam.param_groups
-    (parameters,) = group["params"]
-    state = adam.state[parameters]
-    if not state:
-        state["step"] = torch.zeros(())
-        state["exp_avg"] = torch.zeros_like(parameters)
-        state["exp_avg_sq"] = torch.zeros_like(parameters)
-    names = ("exp_avg", "exp_avg_sq", "step")
-    return numba_kernels.Optimiser(*(state[name].detach().view(-1).numpy() for name in names))
+    found = []
+    for parameters in group["params"]:
+        state = adam.state[parameters]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["exp_avg"] = torch.zeros_like(parameters)
+            state["exp_avg_sq"] = torch.zeros_like(parameters)
+        moments = (state[name].detach().view(-1) for name in ("exp_avg", "exp_avg_sq", "step"))
+        found.append(numba_kernels.Optimiser(*(moment.numpy() for moment in moments)))
+    return found
+
+
+def optimiser(adam: torch.optim.Adam) -> numba_kernels.Optimiser:
+    """The state of an Adam over one tensor."""
+    (only,) = optimisers(adam)
+    return only
 
 
 class NumbaSteps(TorchSteps):

@@ -9,9 +9,12 @@ import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
 from safemr.learning.episode_statistics import EpisodeStatistics
+from safemr.learning.interface import control_steps, interface_of
+from safemr.learning.normalisation import Normaliser
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
 from safemr.learning.replay import Replay
@@ -33,12 +36,18 @@ class Trainer:
     def __init__(self, config: Any, make_envs: MakeEnvs, seed: int, total_steps: int) -> None:
         self.config, self.step = config, 0
         self.envs = make_envs(config.num_envs)
+        self.interface = interface_of(self.envs)
+        # Control steps of a decision of all sub-environments; short ones have fewer.
+        self._stride = config.num_envs * self.interface.action_repeat
         space = self.envs.single_action_space
         if not isinstance(space, gym.spaces.Box):
             raise TypeError(f"continuous actions are required, found {space}")
         action_dim = int(np.prod(space.shape))
-        self.transform = ObservationTransform.for_layout(self.envs.observation_layout)
-        updates = max(total_steps - config.start_steps, 0) // config.update_every
+        self.transform = ObservationTransform.for_envs(self.envs, self.interface.decode)
+        self.normaliser = Normaliser(self.transform, total_steps)
+        steps_an_update = config.update_every * self.interface.action_repeat
+        updates = max(total_steps - config.start_steps, 0) // steps_an_update
+        self._exploring_until = config.explore_until * total_steps
         self.agent = self.agent_type(
             config, self.transform.dim, action_dim, self.envs.d_min, seed, updates
         )
@@ -55,11 +64,14 @@ class Trainer:
         self._sampling = generator(seed, 2)  # rows are drawn on the CPU and looked up on the device
         self._random_actions = generator(seed, 3)
         self._held = torch.zeros(config.num_envs, action_dim)
+        self._left = torch.zeros(config.num_envs, dtype=torch.int64)  # decisions of exploration
         self._episodes = EpisodeStatistics(config.num_envs)
         self._owed = 0.0  # gradient steps earned by experience, not yet done
         observations, infos = self.envs.reset(seed=environment_seed(seed, 4))
         self._observations: NDArray[np.float32] = self.transform(observations)
         self._features = self._energy_features(infos)
+        self.normaliser.observe(self._observations, self.step)
+        self.normaliser.follow()
 
     @staticmethod
     def _energy_features(infos: Mapping[str, Any]) -> NDArray[np.float32]:
@@ -81,6 +93,7 @@ class Trainer:
                 continue
             self._owed -= updates
             drawn = self.replay.sample(updates * config.batch_size, self._sampling)
+            drawn = self.normaliser.batch(drawn)
             done = self.agent.updates
             measure = (done + updates) // MEASURE_EVERY > done // MEASURE_EVERY
             info = self.agent.update(drawn, updates, measure)
@@ -95,16 +108,19 @@ class Trainer:
         return metrics | {f"train_{name}": v for name, v in self._episodes.pop().items()}
 
     def _interact(self) -> None:
-        """One time step of every sub-environment."""
+        """One decision of every sub-environment."""
         config = self.config
         device = config.device
         if self.step < config.start_steps:
-            if self.step % (config.start_hold * config.num_envs) == 0:
+            if self.step // self._stride % config.start_hold == 0:
                 self._held.uniform_(-1.0, 1.0, generator=self._random_actions)
             action = self._held
         else:
-            action = self.agent.act(torch.from_numpy(self._observations).to(device)).cpu()
+            seen = torch.from_numpy(self.normaliser(self._observations))
+            action = self.agent.act(seen.to(device)).cpu()
             check_finite(self.step, {"action": float(action.sum())})
+            if config.explore_share > 0.0:
+                action = self._explore(action)
         raw, rewards, terminated, truncated, infos = self.envs.step(action.numpy())
         observations, features = self.transform(raw), self._energy_features(infos)
         reached, reached_features = observations, features
@@ -128,12 +144,42 @@ class Trainer:
         self.replay.add(actions=action, **tensors)
         self._episodes.update(rewards, terminated, truncated, infos)
         self._observations, self._features = observations, features
-        self.step += config.num_envs
+        self.step += control_steps(infos, config.num_envs)
+        self.normaliser.observe(reached, self.step)
+        self.normaliser.follow()
+
+    def _explore(self, actions: Tensor) -> Tensor:
+        """The policy's actions [N, A], or random ones that are held for several decisions.
+
+        Temporally extended epsilon-greedy exploration (Dabney et al., arXiv:2006.01782), except
+        that durations are uniform and its probability falls linearly to 0, so that the violations
+        logged towards the end are the policy's.
+        """
+        config, draw = self.config, self._random_actions
+        count = config.num_envs
+        fading = max(1.0 - self.step / max(self._exploring_until, 1.0), 0.0)
+        begin = torch.rand(count, generator=draw) < config.explore_share * fading
+        begin &= self._left == 0
+        lengths = torch.randint(
+            config.explore_hold_min, config.explore_hold_max + 1, (count,), generator=draw
+        )
+        random = torch.empty_like(actions).uniform_(-1.0, 1.0, generator=draw)
+        self._held = torch.where(begin[:, None], random, self._held)
+        self._left = torch.where(begin, lengths, self._left)
+        exploring = self._left > 0
+        self._left = (self._left - 1).clamp_min(0)
+        return torch.where(exploring[:, None], self._held, actions)
 
     @property
     def policy(self) -> Policy:
         """The current policy with what figures need of the run: lambda's network and zeta."""
-        return Policy(self.transform, self.agent.policy, squash=True, extras=self.agent.extras())
+        return Policy(
+            self.normaliser.settled(self.transform),
+            self.agent.policy,
+            squash=True,
+            extras=self.agent.extras(),
+            interface=self.interface,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -144,9 +190,11 @@ class Trainer:
             "sampling": self._sampling.get_state(),
             "random_actions": self._random_actions.get_state(),
             "held": self._held,
+            "exploring": self._left,
             "episodes": self._episodes.state_dict(),
             "observations": self._observations,
             "features": self._features,
+            "normaliser": self.normaliser.state_dict(),
             "envs": self.envs.get_state(),
         }
 
@@ -157,8 +205,18 @@ class Trainer:
         self._sampling.set_state(torch.as_tensor(state["sampling"]))
         self._random_actions.set_state(torch.as_tensor(state["random_actions"]))
         self._held.copy_(torch.as_tensor(state["held"]))
+        if "exploring" in state:  # checkpoints were once without
+            self._left.copy_(torch.as_tensor(state["exploring"]))
         self._episodes.load_state_dict(state["episodes"])
         # np.array keeps the order in memory, which decides how products with them round.
         self._observations = np.array(state["observations"], np.float32)
         self._features = np.array(state["features"], np.float32)
-        self.envs.set_state(state["envs"])
+        if "normaliser" in state:
+            self.normaliser.load_state_dict(state["normaliser"])
+        begun = self.envs.set_state(state["envs"])
+        if begun is not None:
+            observations, infos = begun
+            self._observations = self.transform(observations)
+            self._features = self._energy_features(infos)
+            self._episodes.abandon()
+            self.replay.cut()

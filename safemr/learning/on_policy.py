@@ -10,7 +10,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -18,12 +18,18 @@ from torch import Tensor
 
 from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
 from safemr.learning.episode_statistics import EpisodeStatistics
-from safemr.learning.gaussian import GaussianActor, entropy, kl_divergence, log_density
+from safemr.learning.gaussian import GaussianActor, entropy, log_density, ratio_and_kl
 from safemr.learning.hyperparameters import Hyperparameters, Setting
+from safemr.learning.interface import control_steps, interface_of
 from safemr.learning.networks import ACTIVATIONS, Activation, StackedMLP
+from safemr.learning.normalisation import Normaliser
 from safemr.learning.observation import ObservationTransform
 from safemr.learning.policies import Policy
-from safemr.learning.rollouts import Rollout, gae, minibatches
+from safemr.learning.rollouts import Batch, Rollout, gae, minibatches
+from safemr.learning.trust_region import Region, TorchRegion
+
+if TYPE_CHECKING:
+    from safemr.learning.on_policy_steps import FusedSteps
 
 # Settings of the published experiments (safety-starter-agents) that differ from the defaults here;
 # the algorithms add their own. Networks and epoch are those of the JointSIS authors' comparison.
@@ -38,17 +44,22 @@ PUBLISHED: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class OnPolicyConfig(Hyperparameters):
-    """What the on-policy algorithms share. Steps are environment steps."""
+    """What the on-policy algorithms share.
+
+    A sample is a decision: an action held for the interface's ``action_repeat`` control steps
+    (`safemr.learning.interface`), usually one.
+    """
 
     cost_limit: float = 0.0  # of an episode's undiscounted cost
-    gamma: float = 0.99  # discount of the reward; below 1, as time limits are bootstrapped through
-    cost_gamma: float = 0.99  # discount of the cost
+    # discount of the reward, a decision; below 1, as time limits are bootstrapped through
+    gamma: float = 0.99
+    cost_gamma: float = 0.99  # discount of the cost, a decision
     gae_lambda: float = 0.97  # lambda of the reward's generalised advantages (GAE)
     cost_gae_lambda: float = 0.97  # lambda of the cost's
     target_kl: float = 0.01  # PPO: stop beyond kl_stop times it; trust region: its radius
 
     num_envs: int = 8  # environments stepped together
-    epoch_steps: int = 8_000  # between two updates, over all environments
+    epoch_steps: int = 8_000  # control steps between two updates, over all environments
 
     hidden: int = 64  # units of each of the two hidden layers
     activation: Activation = "tanh"  # of the hidden layers
@@ -56,6 +67,7 @@ class OnPolicyConfig(Hyperparameters):
     value_lr: float = 1e-3  # learning rate of both critics
     value_passes: int = 8  # over the epoch's data, for both critics
     value_batch: int = 500  # samples a critic step; at most the whole epoch
+    backend: Literal["torch", "fused"] = "torch"  # PyTorch, or numba's kernels, which are faster
 
     RANGES: ClassVar[Mapping[str, str]] = {
         "cost_limit": "[0, inf)",
@@ -69,7 +81,11 @@ class OnPolicyConfig(Hyperparameters):
         "value_lr": "(0, 1]",  # Adam moves every parameter by about its rate a step
         **dict.fromkeys(("value_passes", "value_batch"), "[1, inf)"),
     }
-    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {"activation": ACTIVATIONS}
+    ADDED: ClassVar[frozenset[str]] = frozenset({"backend"})
+    CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "activation": ACTIVATIONS,
+        "backend": ("torch", "fused"),
+    }
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -85,46 +101,12 @@ class OnPolicyConfig(Hyperparameters):
             self.epoch_steps <= setting.total_steps,
             f"must not exceed the budget of {setting.total_steps} steps",
         )
-
-
-@dataclass(frozen=True)
-class Batch:
-    """An epoch's B samples, or some of them, and the policy that took them."""
-
-    observations: Tensor  # [B, D], transformed
-    actions: Tensor  # [B, A], before the environment's clipping
-    mean: Tensor  # [B, A] of the old policy
-    log_std: Tensor  # [A] of the old policy
-    log_density: Tensor  # [B] of the actions under the old policy
-    advantages: Tensor  # [B], standardised
-    cost_advantages: Tensor  # [B], centred
-    returns: Tensor  # [2, B], discounted reward and cost to go
-    episode_cost: float  # EpCost, see `OnPolicyTrainer.episode_cost`
-    episode_length: float  # its length in steps
-
-    def select(self, indices: Tensor | slice) -> Batch:
-        """The samples of a minibatch."""
-        if isinstance(indices, slice):
-            return self
-        return Batch(
-            self.observations[indices],
-            self.actions[indices],
-            self.mean[indices],
-            self.log_std,
-            self.log_density[indices],
-            self.advantages[indices],
-            self.cost_advantages[indices],
-            self.returns[:, indices],
-            self.episode_cost,
-            self.episode_length,
+        stride = self.num_envs * setting.action_repeat
+        self.require(
+            "epoch_steps",
+            self.epoch_steps % stride == 0,
+            f"must be a multiple of num_envs x action_repeat = {stride}",
         )
-
-
-def ratio_and_kl(actor: GaussianActor, batch: Batch) -> tuple[Tensor, Tensor]:
-    """pi(a|s) / pi_old(a|s), [B], and E_s[KL(pi_old || pi)], both differentiable."""
-    mean = actor.mean(batch.observations)
-    ratio = torch.exp(log_density(batch.actions, mean, actor.log_std) - batch.log_density)
-    return ratio, kl_divergence(batch.mean, batch.log_std, mean, actor.log_std).mean()
 
 
 def explained_variance(predictions: np.ndarray, targets: np.ndarray) -> float:
@@ -143,7 +125,9 @@ class OnPolicyTrainer(ABC):
     ) -> None:
         self.config, self.step = config, 0
         self.envs = make_envs(config.num_envs)
-        self.transform = ObservationTransform.for_layout(self.envs.observation_layout)
+        self.interface = interface_of(self.envs)
+        self.transform = ObservationTransform.for_envs(self.envs, self.interface.decode)
+        self.normaliser = Normaliser(self.transform, total_steps)
         inputs, actions = self.transform.dim, int(np.prod(self.envs.single_action_space.shape))
         sizes, weights = (inputs, config.hidden, config.hidden), generator(seed, 0)
         network = StackedMLP(
@@ -154,18 +138,33 @@ class OnPolicyTrainer(ABC):
         self.critic_optimizer = torch.optim.Adam(
             [self.critics.parameters], lr=config.value_lr, fused=True
         )
+        self.fused = self._fused() if config.backend == "fused" else None
         self.noise, self.order = generator(seed, 1), generator(seed, 2)
         self.rollout = Rollout(
-            config.epoch_steps // config.num_envs, config.num_envs, inputs, actions
+            config.epoch_steps // (config.num_envs * self.interface.action_repeat),
+            config.num_envs,
+            inputs,
+            actions,
         )
         self.statistics = EpisodeStatistics(config.num_envs)
         self.observations, _ = self.envs.reset(seed=environment_seed(seed, 3))
+        self._seen(self.observations)
+        self.normaliser.follow()
+
+    def _fused(self) -> FusedSteps:
+        from safemr.learning.on_policy_steps import FusedSteps  # compiled when it is asked for
+
+        return FusedSteps(self.actor, self.critics)
 
     @property
     def policy(self) -> Policy:
         """The current policy; it follows further training."""
         return Policy(
-            self.transform, self.actor.network, squash=False, log_std=self.actor.log_std.detach()
+            self.normaliser.settled(self.transform),
+            self.actor.network,
+            squash=False,
+            log_std=self.actor.log_std.detach(),
+            interface=self.interface,
         )
 
     @abstractmethod
@@ -185,40 +184,64 @@ class OnPolicyTrainer(ABC):
         check_finite(self.step, metrics)
         return metrics
 
+    def _seen(self, observations: np.ndarray) -> np.ndarray:
+        """Raw observations [N, obs] as the networks see them in this epoch, [N, D]."""
+        read = self.transform(observations)
+        self.normaliser.observe(read, self.step)
+        return self.normaliser(read)
+
     def _epoch(self) -> dict[str, float]:
         batch, metrics = self._collect()
         metrics |= self.update_policy(batch)
-        with torch.no_grad():
-            metrics["kl"] = float(ratio_and_kl(self.actor, batch)[1])
+        metrics["kl"] = self._divergence(batch)
         metrics["entropy"] = entropy(self.actor.log_std)
-        return metrics | self._fit_critics(batch)
+        metrics |= self._fit_critics(batch)
+        self.normaliser.follow()  # between two epochs: one rollout is read in one way
+        return metrics
+
+    @torch.no_grad()
+    def _divergence(self, batch: Batch) -> float:
+        """E_s[KL(pi_old || pi)]."""
+        if self.fused:
+            return self.fused.surrogates(batch)[2]
+        return float(ratio_and_kl(self.actor, batch)[1])
+
+    def region(self, batch: Batch) -> Region:
+        """The trust region's derivatives at the actor as it is."""
+        return self.fused.region(batch) if self.fused else TorchRegion(self.actor, batch)
+
+    def _act(self, observations: np.ndarray, perturbation: np.ndarray) -> np.ndarray:
+        """Mean actions plus a perturbation, [N, A], for transformed observations [N, D]."""
+        if self.fused:
+            return self.fused.act(observations, perturbation)
+        mean = self.actor.mean(torch.from_numpy(observations))
+        return (mean + torch.from_numpy(perturbation)).numpy()
 
     def _collect(self) -> tuple[Batch, dict[str, float]]:
         """One rollout with the current policy, and its advantages."""
         config, rollout = self.config, self.rollout
-        episodes_before = len(self.statistics.finished)
+        episodes_before, steps = len(self.statistics.finished), 0
         rollout.clear()
         std = self.actor.log_std.detach().exp()
         noise = std * torch.randn(rollout.actions.shape, generator=self.noise)
         with torch.no_grad():
-            for perturbation in noise:
-                inputs = torch.from_numpy(self.transform(self.observations))
-                actions = self.actor.mean(inputs) + perturbation
-                self.observations, rewards, terminated, truncated, infos = self.envs.step(
-                    actions.numpy()
-                )
+            for perturbation in noise.numpy():
+                inputs = self._seen(self.observations)
+                actions = self._act(inputs, perturbation)
+                self.observations, rewards, terminated, truncated, infos = self.envs.step(actions)
                 self.statistics.update(rewards, terminated, truncated, infos)
+                steps += control_steps(infos, config.num_envs)
                 finals = None
                 if truncated.any():
-                    finals = torch.from_numpy(self.transform(infos["final_obs"]))
+                    finals = self._seen(infos["final_obs"])
                 rollout.add(inputs, actions, rewards, infos["cost"], terminated, truncated, finals)
-            rollout.close(torch.from_numpy(self.transform(self.observations)))
-        self.step += config.epoch_steps
-        return self._batch(episodes_before)
+            rollout.close(self._seen(self.observations))
+        self.step += steps
+        return self._batch(episodes_before, steps)
 
-    def _batch(self, episodes_before: int) -> tuple[Batch, dict[str, float]]:
+    def _batch(self, episodes_before: int, steps: int) -> tuple[Batch, dict[str, float]]:
         config, rollout = self.config, self.rollout
-        values, following = rollout.values(self.critics)
+        values, following = rollout.values(self.fused.values if self.fused else self.critics)
         advantages, returns = np.empty_like(values), np.empty_like(values)
         settings = (
             (config.gamma, config.gae_lambda),
@@ -236,10 +259,10 @@ class OnPolicyTrainer(ABC):
         observations = rollout.observations[:-1].flatten(0, 1)
         actions = rollout.actions.flatten(0, 1)
         with torch.no_grad():
-            mean = self.actor.mean(observations)
+            mean = (self.fused or self.actor).mean(observations)
             log_std = self.actor.log_std.detach().clone()
             densities = log_density(actions, mean, log_std)
-        episode_cost, episode_length = self.episode_cost(episodes_before)
+        episode_cost, episode_length = self.episode_cost(episodes_before, steps)
         batch = Batch(
             observations,
             actions,
@@ -250,7 +273,7 @@ class OnPolicyTrainer(ABC):
             cost_advantages,
             torch.from_numpy(returns).float(),
             episode_cost,
-            episode_length,
+            episode_length * len(actions) / steps,
         )
         metrics = {"epoch_cost": episode_cost}
         for name, prediction, target in zip(("reward", "cost"), values, returns, strict=True):
@@ -259,15 +282,15 @@ class OnPolicyTrainer(ABC):
                 metrics[f"explained_variance_{name}"] = share
         return batch, metrics
 
-    def episode_cost(self, episodes_before: int) -> tuple[float, float]:
+    def episode_cost(self, episodes_before: int, steps: int) -> tuple[float, float]:
         """EpCost and episode length: means over the episodes that finished in this epoch.
 
-        In an epoch without one, the epoch's cost a step times the time limit, which has the same
-        mean where episodes end by their time limit only.
+        In an epoch without one, the epoch's cost a control step (of ``steps``) times the time
+        limit, which has the same mean where episodes end by their time limit only.
         """
         finished = self.statistics.finished[episodes_before:]
         if len(finished) == 0:
-            rate = float(self.rollout.signals[1].mean())
+            rate = float(self.rollout.signals[1].sum()) / steps
             return rate * self.envs.max_episode_steps, float(self.envs.max_episode_steps)
         names = self.statistics.names
         means = finished.mean(0)
@@ -278,16 +301,20 @@ class OnPolicyTrainer(ABC):
         config, losses = self.config, []
         for _ in range(config.value_passes):
             for indices in minibatches(len(batch.actions), config.value_batch, self.order):
-                values = self.critics(batch.observations[indices]).squeeze(-1)
-                errors = values - batch.returns[:, indices]
-                loss = errors.square().mean(1)
-                (self.critics.parameters.grad,) = torch.autograd.grad(
-                    loss.sum(), self.critics.parameters
-                )
-                self.critic_optimizer.step()
-                losses.append(loss.detach())
+                losses.append(self._value_step(batch, indices))
         reward_loss, cost_loss = torch.stack(losses).mean(0).tolist()
         return {"value_loss": reward_loss, "cost_value_loss": cost_loss}
+
+    def _value_step(self, batch: Batch, indices: Tensor | slice) -> Tensor:
+        """One step on a minibatch; the losses of both critics before it, [2]."""
+        if self.fused:
+            return self.fused.value_step(batch, indices, self.critic_optimizer)
+        values = self.critics(batch.observations[indices]).squeeze(-1)
+        errors = values - batch.returns[:, indices]
+        loss = errors.square().mean(1)
+        (self.critics.parameters.grad,) = torch.autograd.grad(loss.sum(), self.critics.parameters)
+        self.critic_optimizer.step()
+        return loss.detach()
 
     def state_dict(self) -> dict[str, Any]:
         return {
@@ -299,6 +326,7 @@ class OnPolicyTrainer(ABC):
             "order": self.order.get_state(),
             "observations": self.observations,
             "statistics": self.statistics.state_dict(),
+            "normaliser": self.normaliser.state_dict(),
             "envs": self.envs.get_state(),
         }
 
@@ -311,4 +339,9 @@ class OnPolicyTrainer(ABC):
         self.order.set_state(state["order"])
         self.observations = np.array(state["observations"])  # in the same order in memory
         self.statistics.load_state_dict(state["statistics"])
-        self.envs.set_state(state["envs"])
+        if "normaliser" in state:
+            self.normaliser.load_state_dict(state["normaliser"])
+        begun = self.envs.set_state(state["envs"])
+        if begun is not None:
+            self.observations, _ = begun
+            self.statistics.abandon()

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from safemr.errors import UserError
 from safemr.files import POLICY, policy_arrays
+from safemr.learning.interface import Interface
 from safemr.learning.networks import ACTIVATIONS, StackedMLP
 from safemr.learning.observation import ObservationTransform
 
@@ -48,6 +49,8 @@ class Policy:
     ``squash``: the network gives mean and log standard deviation of a tanh-squashed Gaussian
     (the soft actor-critic family); otherwise it gives the mean of a Gaussian whose log standard
     deviation is ``log_std`` [A] and whose sample the environment clips (the on-policy family).
+    ``interface`` is the one it was trained through: its actions are the environment's, already
+    scaled, and each is to be held for ``action_repeat`` control steps.
     """
 
     def __init__(
@@ -58,10 +61,17 @@ class Policy:
         squash: bool,
         log_std: torch.Tensor | None = None,
         extras: Mapping[str, NDArray] | None = None,
+        interface: Interface | None = None,
     ) -> None:
         self.transform, self.network = transform, network
+        self.interface = interface or Interface()
         self.squash, self.log_std = squash, log_std
         self.extras = dict(extras or {})
+
+    @property
+    def action_repeat(self) -> int:
+        """Control steps for which an action is to be held."""
+        return self.interface.action_repeat
 
     @torch.no_grad()
     def act(
@@ -87,7 +97,14 @@ class Policy:
                 raise ValueError("this policy has no standard deviation to sample with")
             noise = torch.randn(mean.shape, generator=generator).to(mean.device)
             mean = mean + log_std.exp() * noise
-        return (mean.tanh() if self.squash else mean.clamp(-1.0, 1.0)).cpu().numpy()
+        actions = (mean.tanh() if self.squash else mean.clamp(-1.0, 1.0)).cpu().numpy()
+        return self.interface.scaled(actions)
+
+    def __call__(
+        self, observations: NDArray[np.floating], deterministic: bool = True
+    ) -> NDArray[np.float32]:
+        """`act`."""
+        return self.act(observations, deterministic)
 
     def arrays(self) -> Arrays:
         """Everything needed to act again, as arrays for `numpy.savez`."""
@@ -101,13 +118,36 @@ class Policy:
         }
         if self.log_std is not None:
             arrays["log_std"] = self.log_std.detach().cpu().numpy().copy()
+        if self.transform.shift is not None:
+            arrays["shift"] = self.transform.shift
+            arrays["width"] = np.array(self.transform.width, np.int64)
+        if self.transform.lidars:
+            arrays["lidars"] = np.array(self.transform.lidars, np.int64)
+            arrays["width"] = np.array(self.transform.width, np.int64)
+        if self.action_repeat > 1:
+            arrays["action_repeat"] = np.array(self.action_repeat, np.int64)
+        if self.interface.action_scale:
+            arrays["action_scale"] = np.array(self.interface.action_scale)
         return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray]) -> Policy:
-        transform = ObservationTransform(arrays["columns"], arrays["scale"], arrays["clip"])
+        transform = ObservationTransform(
+            arrays["columns"],
+            arrays["scale"],
+            arrays["clip"],
+            int(arrays["width"]) if "width" in arrays else None,
+            tuple(int(start) for start in arrays.get("lidars", ())),
+            arrays.get("shift"),
+        )
+        interface = Interface(
+            int(arrays.get("action_repeat", 1)), tuple(map(float, arrays.get("action_scale", ())))
+        )
         log_std = torch.from_numpy(arrays["log_std"]) if "log_std" in arrays else None
-        known = {"squash", "columns", "scale", "clip", "log_std"}
+        known = {
+            *("squash", "columns", "scale", "clip", "log_std"),
+            *("lidars", "width", "action_repeat", "action_scale", "shift"),
+        }
         extras = {
             key: value
             for key, value in arrays.items()
@@ -119,6 +159,7 @@ class Policy:
             squash=bool(arrays["squash"]),
             log_std=log_std,
             extras=extras,
+            interface=interface,
         )
 
 

@@ -90,6 +90,11 @@ class Replay:
         self._head = (self._head + 1) % self.capacity
         self.size = min(self.size + 1, self.capacity)
 
+    def cut(self) -> None:
+        """What was added last is not continued: its episodes end there, as if truncated."""
+        newest = (self._head - 1) % self.capacity * self.num_envs
+        self._fields["ended"][newest : newest + self.num_envs] = 1.0
+
     def sample(self, count: int, generator: torch.Generator) -> Batch:
         """``count`` transitions, uniformly with replacement."""
         flat = torch.randint(self.size * self.num_envs, (count,), generator=generator)

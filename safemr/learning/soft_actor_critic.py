@@ -30,7 +30,11 @@ from safemr.learning.torch_steps import TorchSteps
 
 @dataclass(frozen=True)
 class SoftActorCriticConfig(Hyperparameters):
-    """What the off-policy algorithms share; steps are environment steps."""
+    """What the off-policy algorithms share.
+
+    A decision is an action held for the interface's ``action_repeat`` control steps
+    (`safemr.learning.interface`), usually one.
+    """
 
     constraint_scale: float = 1.0  # the constraint critic learns this times the constraint
 
@@ -44,9 +48,10 @@ class SoftActorCriticConfig(Hyperparameters):
 
     # Soft actor-critic
 
-    gamma: float = 0.99  # discount of the reward; below 1, as time limits are bootstrapped through
+    # discount of the reward, a decision; below 1, as time limits are bootstrapped through
+    gamma: float = 0.99
     polyak: float = 0.005  # share by which the target critics follow in a gradient step
-    n_step: int = 5  # rewards summed before the bootstrap
+    n_step: int = 5  # decisions whose rewards are summed before the bootstrap
     critic_lr: float = 1e-3  # learning rate of the three critics
     policy_lr: float = 1e-3  # learning rate of the policy
     temperature_lr: float = 3e-4  # learning rate of log alpha
@@ -64,12 +69,18 @@ class SoftActorCriticConfig(Hyperparameters):
     # Experience
 
     num_envs: int = 16  # environments stepped together
-    update_every: int = 8  # environment steps per gradient step
+    update_every: int = 8  # decisions per gradient step
     updates_together: int = 4  # gradient steps done in one go, sharing one draw and its targets
     batch_size: int = 256  # transitions a gradient step
     replay_capacity: int = 500_000  # transitions kept
-    start_steps: int = 5_000  # random actions first, without learning
-    start_hold: int = 10  # steps for which each of them is held
+    start_steps: int = 5_000  # control steps of random actions first, without learning
+    start_hold: int = 10  # decisions for which each of them is held
+    # probability that a decision of an environment begins a random action that is held for several;
+    # it falls linearly to 0
+    explore_share: float = 0.0
+    explore_hold_min: int = 3  # least number of decisions for which it is held
+    explore_hold_max: int = 15  # largest number
+    explore_until: float = 0.8  # share of the run's steps at which the probability is 0
     device: str = "cpu"  # PyTorch's name of the device that learns
     backend: Literal["fused", "torch"] = "fused"  # numba's kernels (CPU only), or PyTorch
 
@@ -92,7 +103,13 @@ class SoftActorCriticConfig(Hyperparameters):
         "batch_size": "[1, 1e6]",
         "replay_capacity": "[1, 1e8]",
         "start_steps": "[0, inf)",
+        "explore_share": "[0, 1]",
+        **dict.fromkeys(("explore_hold_min", "explore_hold_max"), "[1, 1000]"),
+        "explore_until": "(0, 1]",
     }
+    ADDED: ClassVar[frozenset[str]] = frozenset(
+        {"explore_share", "explore_hold_min", "explore_hold_max", "explore_until"}
+    )
     CHOICES: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "activation": ACTIVATIONS,
         "multiplier_action": ("policy", "replay"),
@@ -112,6 +129,11 @@ class SoftActorCriticConfig(Hyperparameters):
             self.batch_size <= self.replay_capacity,
             f"must not exceed replay_capacity = {self.replay_capacity}",
         )
+        self.require(
+            "explore_hold_max",
+            self.explore_hold_max >= self.explore_hold_min,
+            f"must be at least explore_hold_min = {self.explore_hold_min}",
+        )
 
     def delays(self) -> tuple[str, ...]:
         """Fields that hold numbers of gradient steps between two of one kind."""
@@ -128,21 +150,22 @@ class SoftActorCriticConfig(Hyperparameters):
         )
         self.require(
             "n_step",
-            self.n_step <= setting.episode_steps,
-            f"must not exceed the {setting.episode_steps} steps of an episode",
+            self.n_step <= setting.episode_decisions,
+            f"must not exceed the {setting.episode_decisions} decisions of an episode",
         )
         self.require(
             "start_steps",
             self.start_steps < setting.total_steps,
             f"must lie below the budget of {setting.total_steps} steps, or nothing is learned",
         )
-        updates = (setting.total_steps - self.start_steps) // self.update_every
+        steps_an_update = self.update_every * setting.action_repeat
+        updates = (setting.total_steps - self.start_steps) // steps_an_update
         for name in self.delays():
             self.require(
                 name,
                 getattr(self, name) <= updates,
                 f"must not exceed the run's {updates} gradient steps ((budget - start_steps) / "
-                "update_every)",
+                "(update_every x action_repeat))",
             )
 
 

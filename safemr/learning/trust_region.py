@@ -11,14 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from torch import Tensor
 
-from safemr.learning.gaussian import GaussianActor
+from safemr.learning.gaussian import GaussianActor, ratio_and_kl
+from safemr.learning.rollouts import Batch
 
 Product = Callable[[Tensor], Tensor]
+Loss = Callable[[Any, Any], Any]  # linear in the two surrogates E[r A] and E[r A_cost]
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,45 @@ def fisher_vector_product(actor: GaussianActor, observations: Tensor, damping: f
         return torch.cat([pulled, 2.0 * log_std_tangent]).add_(v, alpha=damping)
 
     return product
+
+
+class Region(Protocol):
+    """The surrogates of a batch and their derivatives at the actor that took it."""
+
+    old: tuple[Any, Any]  # E[r A], E[r A_cost] before the actor is moved
+
+    def surrogates(self) -> tuple[Any, Any, Any]:
+        """E[r A], E[r A_cost] and E_s[KL(pi_old || pi)] of the actor as it is now."""
+
+    def gradient(self, loss: Loss) -> Tensor:
+        """That of a loss, [P]; to be asked for before the actor is moved."""
+
+    def product(self, damping: float) -> Product:
+        """`fisher_vector_product`; to be used before the actor is moved."""
+
+
+class TorchRegion:
+    """`Region` by differentiable operations, the definition."""
+
+    def __init__(self, actor: GaussianActor, batch: Batch) -> None:
+        self.actor, self.batch = actor, batch
+        self._graph = self._evaluate()[:2]
+        self.old = (self._graph[0].detach(), self._graph[1].detach())
+
+    def _evaluate(self) -> tuple[Tensor, Tensor, Tensor]:
+        batch = self.batch
+        ratio, kl = ratio_and_kl(self.actor, batch)
+        return (ratio * batch.advantages).mean(), (ratio * batch.cost_advantages).mean(), kl
+
+    @torch.no_grad()
+    def surrogates(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self._evaluate()
+
+    def gradient(self, loss: Loss) -> Tensor:
+        return self.actor.gradient(loss(*self._graph), retain_graph=True)
+
+    def product(self, damping: float) -> Product:
+        return fisher_vector_product(self.actor, self.batch.observations, damping)
 
 
 def conjugate_gradient(

@@ -4,11 +4,15 @@ Three questions, kept apart: does the analytic condition (*) hold (four verdicts
 `safemr.certificates.feasibility`); does a dense search find states without a safe action
 (`safemr.certificates.falsification`); and does a trained policy pick violating actions although
 safe ones exist. The certificate is given by its parameters, by a run record, or, with neither, is
-each one that the paper prints.
+each one that the paper prints. A record's is checked over its own decisions, as long and as large
+as the interface of the run makes them; one without a record over single control steps. The analytic
+condition is derived for the paper's phi, and left out for other families (`safemr.certificates.
+families`); all else is theirs, too.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +27,7 @@ from safemr.certificates.certificate import EnergyCertificate, Recorded
 from safemr.certificates.feasibility import analytic_condition
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
+from safemr.learning.interface import Interface
 from safemr.measure.policy_check import check_policy
 from safemr.measure.store import Measurements
 from safemr.paper import Zeta
@@ -47,11 +52,20 @@ def paper_certificates() -> list[EnergyCertificate]:
 def certificate_of_record(folder: Path) -> tuple[EnergyCertificate, dict[str, Any]]:
     """The certificate a run ended with, in metres, and its task: the entry in the run's config.
 
-    Raises UserError where there is no record, or one whose certificate is not of the paper's
-    family: the analytic condition and the search are for that one.
+    Raises UserError where there is no record, or one whose certificate is more than a phi of named
+    parameters: the search is for those.
     """
     record = Record.open(folder)
     return EnergyCertificate.from_record(record).in_metres(), record.task
+
+
+def decisions_of(certificate: EnergyCertificate) -> Interface:
+    """How long and how large the actions are over which a certificate is to hold.
+
+    The environment's own where it has no record.
+    """
+    interface: Interface = certificate.record.interface if certificate.record else Interface()
+    return dataclasses.replace(interface, decode=())
 
 
 def certify(
@@ -64,31 +78,44 @@ def certify(
 ) -> tuple[dict[str, Any], falsification.Falsification]:
     """One row of the certificate table, and the search behind it.
 
-    The row: certificate, task, sigma, k, n, eta, the margins of the four analytic verdicts [m/s^2],
+    The row: certificate, task, the parameters by name and, of another family than the paper's,
+    ``family``, eta, the margins of the four analytic verdicts of the paper's family [m/s^2],
     states searched, infeasible and leak share, worst margin, verdicts shared by the simulator, and,
-    with a policy, its violating and avoidable shares in `episodes` episodes, of whose violating
-    steps at most 8 an episode are searched for a safe action.
+    with a policy, its decisions (``policy_steps``) and their violating and avoidable shares in
+    `episodes` episodes, of whose violating decisions at most 8 an episode are searched for a safe
+    action. Where a decision is not one control step, ``action_repeat`` says how many.
     """
     certificate = certificate.in_metres()
+    interface = decisions_of(certificate)
     zeta, eta = certificate.zeta, certificate.eta
     envs = falsification.make_simulator(task)
-    analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
-    search = falsification.falsify(envs, task, zeta, eta=eta, count=states, seed=seed)
+    margins: dict[str, float] = {}
+    if isinstance(zeta, Zeta):
+        analytic = analytic_condition(zeta, float(envs.d_min), eta=eta)
+        margins = {margin_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()}
+    search = falsification.falsify(
+        envs, task, zeta, eta=eta, count=states, seed=seed,
+        action_repeat=interface.action_repeat, action_scale=interface.action_scale,
+    )  # fmt: skip
     envs.close()
     row: dict[str, Any] = {
         "certificate": certificate.name, "task": name_of(task), **zeta._asdict(), "eta": eta,
-        **{margin_column(str(r[1]), str(r[2])): float(r[3]) for r in analytic.itertuples()},
+        **margins,
         "states": len(search.states), "infeasible_share": search.infeasible_share,
         "leak_share": search.leak_share, "worst_margin": search.worst_margin,
         "simulator_agrees": f"{search.confirmed}/{search.examined}",
     }  # fmt: skip
+    if not margins:
+        row["family"] = certificate.energy_family.name
+    if interface.action_repeat != 1:
+        row["action_repeat"] = interface.action_repeat
     if (record := trained_policy(certificate)) is not None:
         check = check_policy(
             record.policy(), task, zeta, eta=eta, num_envs=episodes, seed=seed,
-            limit=8 * episodes,
+            limit=8 * episodes, action_scale=interface.action_scale,
         )  # fmt: skip
         row |= {
-            "policy_steps": check.steps,
+            "policy_steps": check.decisions,
             "policy_violating_share": check.violating_share,
             "policy_avoidable_share": check.avoidable_share,
         }
@@ -107,10 +134,11 @@ def measured_certificate(
     certificate = certificate.in_metres()
     record = trained_policy(certificate)
     inputs = {
-        "name": certificate.name, "zeta": list(certificate.zeta), "eta": certificate.eta,
+        "name": certificate.name, **certificate.entry, "eta": certificate.eta,
         "task": installed(task),
         "states": states, "episodes": episodes,
         "policy": record and record.inputs,
+        **_inputs(certificate),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
@@ -127,12 +155,13 @@ def measured_margins(
     """`margin_map` of a certificate, and the task's d_min, kept among ``measurements``."""
     certificate = certificate.in_metres()
     inputs = {
-        "zeta": list(certificate.zeta), "eta": certificate.eta,
+        **certificate.entry, "eta": certificate.eta,
         "task": installed(task),
+        **_inputs(certificate),
     }  # fmt: skip
 
     def measure() -> dict[str, Any]:
-        margins = margin_map(task, certificate.zeta, eta=certificate.eta)
+        margins = margin_map(certificate, task)
         columns = {name: margins[name].to_numpy() for name in margins}
         return columns | {"d_min": np.array(contact_distance(task))}
 
@@ -142,17 +171,19 @@ def measured_margins(
 
 
 def margin_map(
-    task: Task, zeta: Zeta, *, eta: float = 0.0, distances: int = 37, bearings: int = 37
+    certificate: EnergyCertificate, task: Task, *, distances: int = 37, bearings: int = 37
 ) -> pd.DataFrame:
     """Best margin of the least favourable motion at each distance and bearing.
 
     The maximum over courses within 0.4 rad of the obstacle, three speeds and three turn rates of
-    the least g over the action grid. Returns distance, bearing, margin; nan where the robot would
-    overlap the obstacle. Positive: from some such motion no action is safe.
+    the least g over the action grid, held for a decision. Returns distance, bearing, margin; nan
+    where the robot would overlap the obstacle. Positive: from some such motion no action is safe.
     """
+    certificate, interface = certificate.in_metres(), decisions_of(certificate)
+    zeta, held = certificate.zeta, (interface.action_repeat, interface.action_scale)
     envs = falsification.make_simulator(task, 1)
     robot, d_min = falsification.ROBOT, float(envs.d_min)
-    reach = falsification.largest_distance(zeta, d_min)
+    reach = falsification.largest_distance(zeta, d_min, interface.action_repeat)
     turn_rates = robot.max_turn_rate * np.linspace(-1, 1, 3)
     axes = (np.linspace(d_min, reach, distances), np.linspace(0, np.pi, bearings),
             np.linspace(-0.4, 0.4, 3), robot.max_speed * np.array([0.0, 0.5, 1.0]),
@@ -160,7 +191,10 @@ def margin_map(
     states = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 5)
     parts = np.array_split(states, max(1, len(states) // falsification.CHUNK))
     least = np.concatenate(
-        [falsification.grid_margins(part, d_min, zeta, eta).min(1) for part in parts]
+        [
+            falsification.grid_margins(part, d_min, zeta, certificate.eta, *held).min(1)
+            for part in parts
+        ]
     )
     overlap = falsification.overlaps_obstacle(envs, states)
     envs.close()
@@ -186,6 +220,12 @@ def trained_policy(certificate: EnergyCertificate) -> Recorded | None:
     """The record of the policy that was trained with it, where there is one (it is optional)."""
     record = certificate.record
     return record if record is not None and record.has_policy else None
+
+
+def _inputs(certificate: EnergyCertificate) -> dict[str, Any]:
+    """What the measurements of a certificate depend on where its decisions are not the default."""
+    entry = decisions_of(certificate).entry()
+    return {"interface": entry} if entry else {}
 
 
 def _label(certificate: EnergyCertificate, task: Task) -> str:

@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from safemr.conventions import UNSEEN_SEED
+from safemr.conventions import unseen_seed
 from safemr.errors import UserError
 from safemr.experiment.record import Record
 from safemr.learning.evaluation import play
@@ -20,10 +20,15 @@ EPISODES = 100
 
 
 def evaluate_record(
-    record: Record, *, episodes: int = EPISODES, seed: int = UNSEEN_SEED, deterministic: bool = True
+    record: Record,
+    *,
+    episodes: int = EPISODES,
+    seed: int | None = None,
+    deterministic: bool = True,
 ) -> dict[str, float]:
     """A record's final policy on ``episodes`` layouts of its task: `evaluate`, and ``return_sd``.
 
+    seed: of the first layout; by default one that no run like it was evaluated on (`unseen_seed`).
     ``return_sd`` is the standard deviation of the return over the layouts (nan for one).
 
     Raises:
@@ -32,7 +37,8 @@ def evaluate_record(
     policy = record.policy()
     envs = make_envs(record.task, episodes)
     try:
-        played = play(policy, envs, seed, deterministic)
+        first = unseen_seed(record.seed) if seed is None else seed
+        played = play(policy, envs, first, deterministic)
     finally:
         envs.close()
     returns = played.finished[:, played.names.index("return")]
@@ -62,10 +68,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("records", type=Path, nargs="+", metavar="RECORD", help="its folder")
     parser.add_argument("--episodes", type=int, default=EPISODES, help="one layout each")
-    parser.add_argument("--seed", type=int, default=UNSEEN_SEED, help="of the first layout")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        help="of the first layout (default: those that no run of its kind was evaluated on)",
+    )
     parser.add_argument("--exploring", action="store_true", help="sample the actions")
     options = parser.parse_args(arguments)
-    if options.episodes < 1 or options.seed < 0:
+    if options.episodes < 1 or (options.seed or 0) < 0:
         raise UserError("--episodes must be 1 or more, and --seed 0 or more")
     for folder in options.records:
         found = evaluate_record(

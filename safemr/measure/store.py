@@ -36,6 +36,7 @@ VERSIONS = {
     "margins": 1,
     "rollouts": 1,
     "unseen_layouts": 1,
+    "filters": 1,
     "aircraft_frontier": 1,
     "aircraft_slices": 1,
     "aircraft_learners": 1,

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safemr.certificates.certificate import EnergyCertificate
-from safemr.certificates.energy import energy, largest
+from safemr.certificates.energy import largest
 from safemr.certificates.falsification import make_simulator
+from safemr.certificates.families import Parameters, phi_at
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
 from safemr.files import Arrays
 from safemr.learning.evaluation import Acts
 from safemr.measure.store import Measurements
 from safemr.measure.tracks import GEOMETRY
-from safemr.paper import Zeta
 from safemr.tasks import Task, name_of
 
 if TYPE_CHECKING:
@@ -37,8 +37,9 @@ def episodes(
     seeds: list[int],
     steps: int = 1000,
 ) -> Arrays:
-    """The first `steps` steps of the deterministic policy, one episode a seed.
+    """The first `steps` control steps of the deterministic policy, one episode a seed.
 
+    It is asked for an action where it decides, every ``action_repeat`` steps if it says so.
     Returns robot [T+1, N, 3] (x, y, heading), goal [T+1, N, 2], box [T+1, N, 3] (nan without a
     box), vase [T+1, N, 3] in a task that has one, obstacles [N, M, 2], reward [T, N],
     cost_indicator [T, N], goal_met [T, N], and the task's geometry. The same seeds give the same
@@ -50,6 +51,7 @@ def episodes(
             f"{name_of(task)} episodes have {envs.max_episode_steps} steps, {steps} were asked"
         )
     observations, _ = envs.reset(seed=seeds)
+    action_repeat = getattr(policy, "action_repeat", 1)
     bodies = ("robot", "goal", "box", *(("vase",) if envs.task.has_vase else ()))
     tracks: dict[str, list[NDArray[Any]]] = {name: [] for name in bodies}
     scores: dict[str, list[NDArray[Any]]] = {
@@ -63,7 +65,9 @@ def episodes(
         for name, track in tracks.items():
             track.append(np.array([_pose(getattr(scene, name)) for scene in scenes], np.float32))
         if step < steps:
-            observations, reward, _, _, infos = envs.step(policy.act(observations))
+            if step % action_repeat == 0:
+                actions = policy.act(observations)
+            observations, reward, _, _, infos = envs.step(actions)
             scores["reward"].append(reward.astype(np.float32))
             for name in ("cost_indicator", "goal_met"):
                 scores[name].append(infos[name].astype(np.float32))
@@ -94,7 +98,7 @@ def multipliers(policy: Policy, observations: NDArray[Any]) -> NDArray[np.float6
 
 def multiplier_map(
     policy: Policy,
-    zeta: Zeta,
+    zeta: Parameters,
     task: Task,
     *,
     seed: int = 0,
@@ -125,7 +129,7 @@ def multiplier_map(
         envs.set_state(state)
         observations, *_, infos = envs.step(np.zeros((points, 2), np.float32))
         multiplier[row] = multipliers(policy, observations)
-        phi[row] = largest(energy(infos["d"], infos["d_dot"], envs.d_min, *zeta))
+        phi[row] = largest(phi_at(infos["d"], infos["d_dot"], envs.d_min, zeta))
         multiplier[row, infos["d"].min(1) < envs.d_min] = np.nan
         reached = np.array([envs.scene(index).robot[:2] for index in range(points)])
         moved[row] = reached - worlds["start"][:, :2]
@@ -156,7 +160,7 @@ def measured(
     record = certificate.record
     assert record is not None
     inputs = {
-        "policy": record.inputs, "zeta": list(certificate.zeta),
+        "policy": record.inputs, **certificate.entry,
         "task": installed(task),
         "layouts": layouts, "steps": steps,
     }  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -18,33 +18,34 @@ def table_two(
     *,
     missing: pd.DataFrame | None = None,
     task: str = paper.SENSITIVITY_TASK,
+    parameters: Sequence[str] = paper.Zeta._fields,
 ) -> Table:
     """Table II: learned [sigma, k, n] for each [a, b], per seed and mean.
 
     Beside the paper's, on the task that it names.
-    final: score table with the last values of sigma, k, n (`statistics.last_values`).
-    points: variant -> (a, b).
+    final: score table with the last values of ``parameters`` (`statistics.last_values`), which are
+    those of the energy's family. points: variant -> (a, b).
     """
+    papers = task == paper.SENSITIVITY_TASK and tuple(parameters) == paper.Zeta._fields
     rows = []
     for variant, (a, b) in points.items():
-        zeta = {name: _by_seed(final, task, variant, name) for name in ("sigma", "k", "n")}
+        zeta = {name: _by_seed(final, task, variant, name) for name in parameters}
         for seed in sorted(set().union(*(values.index for values in zeta.values()))):
             rows.append([a, b, variant, str(seed), *(zeta[name][seed] for name in zeta)])
         means = [statistics.mean_interval(values.to_numpy(float)) for values in zeta.values()]
         rows.append([a, b, variant, "mean", *(m.mean for m in means)])
         if not any(np.isnan(m.half_width) for m in means):
             rows.append([a, b, variant, "half width", *(m.half_width for m in means)])
-        if task == paper.SENSITIVITY_TASK and (a, b) in paper.TABLE_II:
+        if papers and (a, b) in paper.TABLE_II:
             rows.append([a, b, variant, "paper", *paper.TABLE_II[(a, b)]])
-    data = pd.DataFrame(rows, columns=["a", "b", "variant", "seed", "sigma", "k", "n"])
+    data = pd.DataFrame(rows, columns=["a", "b", "variant", "seed", *parameters])
     display = pd.DataFrame(
         {
             "[a, b]": [f"[{a:g}, {b:g}]" for a, b in zip(data["a"], data["b"], strict=True)],
             "seed": data["seed"],
-            **{name: [number(value, 3) for value in data[name]] for name in ("sigma", "k", "n")},
+            **{name: [number(value, 3) for value in data[name]] for name in parameters},
         }
     )
-    papers = task == paper.SENSITIVITY_TASK
     beside = ", and the paper's" if papers else ""
     caption = (
         f"{'Table II. ' * papers}Learned energy-function parameters on {task} for each [a, b]: "
@@ -63,12 +64,13 @@ def weight_map(
     task: str = paper.SENSITIVITY_TASK,
     method: str = paper.METHOD,
     baseline: str = paper.ABLATION,
+    parameters: Sequence[str] = paper.Zeta._fields,
 ) -> Table:
     """Final performance and last zeta over a grid of [a, b]; one row of `data` a point.
 
-    scores: `statistics.final_scores`. learned: score table with the last values of sigma, k, n
-    (`statistics.last_values`). points: variant -> (a, b). The difference of returns to `baseline`,
-    which has no regularizer, is Welch's.
+    scores: `statistics.final_scores`. learned: score table with the last values of ``parameters``,
+    those of the energy's family (`statistics.last_values`). points: variant -> (a, b). The
+    difference of returns to `baseline`, which has no regularizer, is Welch's.
     """
     rule = rule or SafetyRule()
     base = statistics.scores_of(scores, task, baseline, "eval_return")
@@ -78,11 +80,11 @@ def weight_map(
         runs += [(a, b, value) for value in returns]
         mean, gap = statistics.mean_interval(returns), statistics.difference_interval(returns, base)
         measured = [statistics.scores_of(scores, task, variant, m) for m in (rule.cost, rule.clean)]
-        zeta = [statistics.scores_of(learned, task, variant, name) for name in ("sigma", "k", "n")]
+        zeta = [statistics.scores_of(learned, task, variant, name) for name in parameters]
         means = [statistics.mean_interval(values).mean for values in (*measured, *zeta)]
         rows.append([a, b, variant, mean.size, mean.mean, mean.half_width, *gap[:3], *means])
     columns = ["a", "b", "variant", "seeds", "return", "half_width", "gain", "gain_low"]
-    columns += ["gain_high", "violating_steps", "clean_share", "sigma", "k", "n"]
+    columns += ["gain_high", "violating_steps", "clean_share", *parameters]
     data = pd.DataFrame(rows, columns=columns)
     display = pd.DataFrame(
         [
@@ -94,18 +96,18 @@ def weight_map(
                 plus_minus(row["gain"], row["gain_low"], row["gain_high"], 2),
                 number(row["violating_steps"], 2),
                 MISSING if np.isnan(row["clean_share"]) else f"{row['clean_share']:.1%}",
-                *(number(row[name], 3) for name in ("sigma", "k", "n")),
+                *(number(row[name], 3) for name in parameters),
             ]
             for _, row in data.iterrows()
         ],
         columns=["[a, b]", "seeds", "return", f"minus {baseline}", "violating steps",
-                 "clean episodes", "sigma", "k", "n"],
+                 "clean episodes", *parameters],
     )  # fmt: skip
     caption = (
         f"{method} over weights [a, b] on {task}: final return and its difference to {baseline}'s, "
         "mean over seeds ± half width of the 95% interval; violating steps, clean episodes and the "
-        "last sigma, k, n, means over seeds. The intervals are not corrected for the number of "
-        "points."
+        f"last {', '.join(parameters)}, means over seeds. The intervals are not corrected for the "
+        "number of points."
     )
     notes = [*_trend(np.array(runs).reshape(-1, 3)), *missing_notes(missing, [task], list(points))]
     return Table("weight_map", caption, data, display, notes)

@@ -22,6 +22,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
 )
 
 from safemr.experiment.config import load
+from safemr.certificates.families import named
 from safemr.errors import UserError
 from safemr.experiment.records import POLICY, PROVENANCE, REQUIRED_FILES
 from safemr.experiment.plan_cache import plan_for
@@ -66,6 +67,12 @@ def entries_of(names):
 def record_files(runs):
     """The files of the records of some runs."""
     return [f"{RESULTS}/{run.path}/{name}" for run in runs for name in REQUIRED_FILES]
+
+
+def parameters_of(runs):
+    """The names of the parameters of some runs' energy functions, each once."""
+    families = {run.config["algorithm"]["hyperparameters"].get("family", "paper"): None for run in runs}
+    return list(dict.fromkeys(name for family in families for name in named(family).names))
 
 
 def expected(runs):

@@ -143,6 +143,7 @@ rule parameters:
         **BUDGET,
         tasks=GRID["tasks"],
         learned=LEARNED,
+        parameters=parameters_of(run for run in PLAN.navigation if run.variant in LEARNED),
         sources=sources("parameters"),
     script:
         "../scripts/parameters.py"
@@ -170,6 +171,7 @@ rule certificate_paths:
             for role in ("method", "ablation")
             if (members := [label for label in PLAN.grid.of(role) if label in LEARNED])
         },
+        parameters=parameters_of(run for run in PLAN.navigation if run.variant in LEARNED),
         sources=sources("certificate_paths"),
     script:
         "../scripts/certificate_paths.py"

@@ -5,6 +5,7 @@ LEARNED_AT_POINTS = dict(
     method=CONFIG.sensitivity and CONFIG.sensitivity.variant,
     ablation=ABLATION,
     points={label: list(point) for label, point in PLAN.points.items()},
+    parameters=parameters_of(PLAN.sensitivity),
 )
 
 

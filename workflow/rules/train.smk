@@ -36,7 +36,7 @@ rule train:
 
 if workflow.is_main_process and workflow.output_settings.dryrun and not CONFIG.allow_missing:
     from safemr.errors import tell
-    from safemr.experiment.forecast import announced
+    from safemr.experiment.forecast import announced, left_out
 
-    for line in announced(CONFIG.results_root, PLAN.trained):
+    for line in announced(CONFIG.results_root, PLAN.trained) + left_out(PLAN.tasks):
         tell(line)

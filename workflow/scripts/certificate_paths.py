@@ -20,5 +20,7 @@ for variant, described in params.algorithms.items():
     for step, updates in log.groupby("step")["value"].mean().items():
         rows.append((variant, step, joint_sis.travelled(config, updates, total)))
 travelled = pd.DataFrame(rows, columns=["variant", "step", "travel"])
-figure = curves.certificate_paths(progress, travelled, groups=params.groups)
+figure = curves.certificate_paths(
+    progress, travelled, groups=params.groups, parameters=params.parameters
+)
 style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))

@@ -16,8 +16,10 @@ returns, costs = (
 )
 figure = curves.sensitivity(returns, costs, points, method=params.method, baseline=params.ablation)
 style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))
-learned = statistics.last_values(chosen, ("sigma", "k", "n"))
+learned = statistics.last_values(chosen, params.parameters)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 missing = statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs))
-table = sensitivity.table_two(learned, points, missing=missing, task=params.task)
+table = sensitivity.table_two(
+    learned, points, missing=missing, task=params.task, parameters=params.parameters
+)
 table.write(Path(snakemake.output.table[0]).parent)

@@ -10,7 +10,7 @@ from safemr.report.figures import style
 
 params = snakemake.params
 points = {variant: (a, b) for variant, (a, b) in params.points.items()}
-learned = statistics.last_values(pd.read_csv(snakemake.input.progress), ("sigma", "k", "n"))
+learned = statistics.last_values(pd.read_csv(snakemake.input.progress), params.parameters)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 table = sensitivity.weight_map(
     pd.read_csv(snakemake.input.scores),
@@ -21,6 +21,8 @@ table = sensitivity.weight_map(
     task=params.task,
     method=params.method,
     baseline=params.ablation,
+    parameters=params.parameters,
 )
 table.write(Path(snakemake.output.table[0]).parent)
-style.save(drawings.weight_map(table.data), Path(snakemake.output.pdf[0]).with_suffix(""))
+figure = drawings.weight_map(table.data, params.parameters)
+style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))

@@ -217,7 +217,10 @@ def draw_margin_map(margins: pd.DataFrame, ax: Axes) -> Axes:
 def certificate_check(
     zetas: Mapping[str, Zeta], d_min: float, margins: pd.DataFrame, mapped: str
 ) -> Figure:
-    """Analytic condition for several certificates, and the searched margins of one of them."""
+    """Analytic condition for several certificates, and the searched margins of one of them.
+
+    zetas: of the paper's family; other families have no such condition.
+    """
     figure = style.new_figure(style.TEXT_WIDTH, 2.7)
     left, right = figure.subplots(1, 2)
     draw_requirement(zetas, d_min, left)

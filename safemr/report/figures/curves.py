@@ -154,6 +154,12 @@ def sensitivity(
     return figure
 
 
+def _symbols(parameters: Sequence[str]) -> dict[str, str]:
+    """How a parameter of an energy function is written; the paper's as in the paper."""
+    papers = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
+    return {name: papers.get(name, name) for name in parameters}
+
+
 @style.styled
 def parameter_evolution(
     progress: pd.DataFrame,
@@ -161,14 +167,16 @@ def parameter_evolution(
     *,
     variants: Sequence[str] = (paper.METHOD, paper.ABLATION),
     fixed: Mapping[str, Mapping[str, float]] | None = None,
+    parameters: Sequence[str] = paper.Zeta._fields,
 ) -> Figure:
-    """sigma, k and n during training: one thin line a seed, the mean bold; one row a task.
+    """The energy's parameters during training: one thin line a seed, the mean bold; one row a task.
 
     progress: tidy table. fixed: variant -> {"sigma": .., "k": .., "n": ..} drawn as level lines.
+    parameters: a column each; a variant has lines in those of its family.
     """
-    names = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
+    names = _symbols(parameters)
     figure = style.new_figure(style.TEXT_WIDTH, 0.7 + 1.25 * len(tasks))
-    axes = figure.subplots(len(tasks), 3, sharex="row", squeeze=False)
+    axes = figure.subplots(len(tasks), len(names), sharex="row", squeeze=False)
     for index, (row, task) in enumerate(zip(axes, tasks, strict=True)):
         for ax, (metric, symbol) in zip(row, names.items(), strict=True):
             chosen = progress[(progress["task"] == task) & (progress["metric"] == metric)]
@@ -197,15 +205,16 @@ def certificate_paths(
     travelled: pd.DataFrame,
     *,
     groups: Mapping[str, Sequence[str]],
+    parameters: Sequence[str] = paper.Zeta._fields,
 ) -> Figure:
     """zeta against the sum of its learning rates so far; one row a group of variants.
 
     progress: tidy table of one task; travelled: variant, step, travel. Where zeta only drifts the
     paths of different rates lie on each other; where it has settled they are level.
     """
-    names = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
+    names = _symbols(parameters)
     figure = style.new_figure(style.TEXT_WIDTH, 0.3 + 1.55 * len(groups))
-    axes = figure.subplots(len(groups), 3, squeeze=False)
+    axes = figure.subplots(len(groups), len(names), squeeze=False)
     for row, (group, variants) in zip(axes, groups.items(), strict=True):
         shades = matplotlib.colormaps["viridis"].resampled(len(variants) + 1)
         for index, variant in enumerate(variants):
@@ -213,6 +222,8 @@ def certificate_paths(
             for ax, metric in zip(row, names, strict=True):
                 chosen = progress[(progress["variant"] == variant) & (progress["metric"] == metric)]
                 mean = chosen.groupby("step")["value"].mean().reset_index().merge(path, on="step")
+                if mean.empty:  # of another family
+                    continue
                 line = ("-", (0, (4, 1.5)), (0, (1, 1.2)))[index % 3]
                 label = variant.removeprefix(group).lstrip("-") or "default"
                 ax.plot(mean["travel"], mean["value"], color=shades(index), ls=line, label=label)
@@ -224,7 +235,7 @@ def certificate_paths(
             ax.set_xticks([], minor=True)
             ax.set_ylabel(symbol, rotation=0, labelpad=6)
         row[0].set_title(group, loc="left")
-        row[2].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        row[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     for ax in axes[-1]:
         ax.set_xlabel("sum of learning rates")
     return figure

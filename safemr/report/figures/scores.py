@@ -176,10 +176,8 @@ _MAPPED = {
     "return": ("final return", "{:.1f}"),
     "half_width": ("half width of its 95% interval", "{:.1f}"),
     "violating_steps": ("violating steps an episode", "{:.2f}"),
-    "sigma": (r"learned $\sigma$", "{:.3f}"),
-    "k": ("learned $k$", "{:.3f}"),
-    "n": ("learned $n$", "{:.3f}"),
 }
+_PAPERS = {"sigma": r"$\sigma$", "k": "$k$", "n": "$n$"}
 
 
 def draw_grid(data: pd.DataFrame, column: str, ax: Axes, *, number: str = "{:.2f}") -> Axes:
@@ -205,27 +203,35 @@ def draw_grid(data: pd.DataFrame, column: str, ax: Axes, *, number: str = "{:.2f
 
 
 @style.styled
-def weight_map(data: pd.DataFrame) -> Figure:
+def weight_map(data: pd.DataFrame, parameters: Sequence[str] = tuple(_PAPERS)) -> Figure:
     """Final performance and learned zeta over the weights [a, b]; data: `sensitivity.weight_map`'s.
 
+    parameters: of the energy's family; the first three are shown.
     A frame marks the points whose return is told apart from the baseline's: white where it is
     higher, black where it is lower.
     """
     figure = style.new_figure(style.TEXT_WIDTH, 4.2)
     axes = figure.subplots(2, 3, sharex=True, sharey=True)
-    for ax, (column, (title, number)) in zip(axes.flat, _MAPPED.items(), strict=True):
+    learned = {
+        name: (f"learned {_PAPERS.get(name, name)}", "{:.3f}") for name in list(parameters)[:3]
+    }
+    shown = {**_MAPPED, **learned}
+    for ax, (column, (title, number)) in zip(axes.flat, shown.items(), strict=False):
         draw_grid(data, column, ax, number=number)
         ax.set_title(title)
+    for ax in axes.flat[len(shown) :]:
+        ax.set_visible(False)
     rank = {name: {v: i for i, v in enumerate(sorted(set(data[name])))} for name in "ab"}
     for _, row in data.iterrows():
         side = "w" if row["gain_low"] > 0 else "k" if row["gain_high"] < 0 else None
         if side:
             corner = (rank["a"][row["a"]] - 0.46, rank["b"][row["b"]] - 0.46)
             axes[0, 0].add_patch(Rectangle(corner, 0.92, 0.92, fill=False, ec=side, lw=1.2))
+    papers = list(parameters) == list(_PAPERS)
     for ax in axes[-1]:
-        ax.set_xlabel(r"$a$, weight of $(\sigma+d_{\min})^n$")
+        ax.set_xlabel(r"$a$, weight of $(\sigma+d_{\min})^n$" if papers else "$a$")
     for ax in axes[:, 0]:
-        ax.set_ylabel("$b$, weight of $k$")
+        ax.set_ylabel("$b$, weight of $k$" if papers else "$b$")
     return figure
 
 

@@ -1,0 +1,1 @@
+"""An energy with an explicit braking distance for `safemr`, as a package of its own."""

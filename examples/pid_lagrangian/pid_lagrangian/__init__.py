@@ -1,0 +1,1 @@
+"""PID-Lagrangian for `safemr`, as a package of its own."""

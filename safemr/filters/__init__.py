@@ -1,0 +1,1 @@
+"""Which action does a certificate allow? The safety filter and its models of what follows."""
