@@ -76,6 +76,16 @@ def test_the_example_keeps_the_contract(example: Any, capsys: pytest.CaptureFixt
         catalogue.hyperparameters(catalogue.load_algorithm(NAME), {"multiplier_lr": 0.1}, "it")
 
 
+def test_it_keeps_the_contract_on_an_environment_from_outside_too(
+    example: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose episodes a resumed run begins anew, and whose normalisation is in its state."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples/unicycle"))
+    task = "unicycle_discs:UnicycleDiscs-v1"
+    found = list(check_algorithm.check(NAME, task, SMALL, steps=1200))
+    assert [checked.fault for checked in found] == [""] * 6
+
+
 def test_a_run_says_where_its_algorithm_comes_from(example: Any, tmp_path: Path) -> None:
     settings = [f"--set={name}={value}" for name, value in SMALL.items()]
     status = train.main(

@@ -22,13 +22,14 @@ from typing import Any
 import numpy as np
 
 from safemr import paper
+from safemr.environments import exact_resume
 from safemr.errors import UserError, show
 from safemr.experiment import planning, records
 from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorithm
 from safemr.experiment.strict_yaml import assignment
 from safemr.learning.hyperparameters import Hyperparameters, declared, meanings, within
 from safemr.learning.interface import Interface
-from safemr.tasks import Task, make_envs, name_of
+from safemr.tasks import Task, make_envs
 
 # What makes a training short, where an algorithm has it and nothing else is asked for.
 SMALL: Mapping[str, Mapping[str, Any]] = {
@@ -59,14 +60,16 @@ def check(
 ) -> Iterator[Checked]:
     """Every promise of the contract, tried one after the other until one is broken.
 
-    name: as in a configuration. settings: hyperparameters. steps: control steps of a training.
+    name: as in a configuration. task: a name, an id from outside, or an entry of a run's config.
+    settings: hyperparameters. steps: control steps of a training. On a task without snapshots a
+    resumed run begins new episodes, so that only what it resumes from is compared.
     Raises UserError where there is no such algorithm or task, or a setting does not fit.
     """
     algorithm = load_algorithm(name)
     fields = {field.name for field in dataclasses.fields(algorithm.hyperparameters)}
     short = {k: v for k, v in SMALL[algorithm.family].items() if k in fields}
     values = hyperparameters(algorithm, {**short, **(settings or {})}, name)
-    entry = planning.describe_task(task, {}) if isinstance(task, str) else dict(task)
+    entry = _entry(task)
     planning.check_setting(algorithm, values, entry, steps, name, HELD)
     trial = _Trial(algorithm, values, entry, steps)
     for promise, attempt in trial.promises().items():
@@ -80,6 +83,16 @@ def check(
             yield Checked(promise, f"{type(error).__name__}: {reason}; {_place(error)}")
             return
         yield Checked(promise)
+
+
+def _entry(task: Task) -> dict[str, Any]:
+    """The entry of a task in a run's config."""
+    if not isinstance(task, str):
+        return dict(task)
+    if not planning.is_id(task):
+        return planning.describe_task(task, {}, "--task")
+    foreign = planning.ForeignTask.said(task, {}, "--task")
+    return planning.describe_foreign(foreign.name, foreign)
 
 
 def _place(error: Exception) -> str:
@@ -239,6 +252,10 @@ class _Trial:
             resumed.load_state_dict(checkpoints.load(path)["state"])
         if resumed.step != trainer.step:
             raise BrokenError(f"step is {resumed.step}, not {trainer.step}, after load_state_dict")
+        if (name := _differing(trainer, resumed)) is not None:
+            raise BrokenError(f"after load_state_dict {name} of the policy is another")
+        if not exact_resume(trainer.envs if hasattr(trainer, "envs") else None):
+            return  # its episodes begin anew
         rows = [each.advance(self.steps) for each in (trainer, resumed)]
         if (name := _differing(trainer, resumed)) is not None:
             raise BrokenError(
@@ -283,7 +300,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("algorithm", help="its name, or PACKAGE.MODULE")
-    parser.add_argument("--task", default=paper.AIRCRAFT_TASK, help="default %(default)s")
+    parser.add_argument(
+        "--task", default=paper.AIRCRAFT_TASK, help="default %(default)s; or PACKAGE:NAME-v0"
+    )
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
                         help="a hyperparameter")  # fmt: skip
     parser.add_argument("--steps", type=int, default=STEPS, help="of a training: %(default)s")
@@ -301,5 +320,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not broken:
         algorithm = load_algorithm(options.algorithm)
         print(f"{algorithm.name}, version {algorithm.version}, keeps the contract on "
-              f"{name_of(options.task)}")  # fmt: skip
+              f"{options.task}")  # fmt: skip
     return int(broken)
