@@ -118,6 +118,10 @@ class SoftActorCriticConfig(Hyperparameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        try:
+            torch.device(self.device)
+        except RuntimeError:
+            self.require("device", False, "not a device of PyTorch; use cpu, cuda or cuda:1")
         self.require(
             "multiplier_delay",
             self.multiplier_delay % self.policy_delay == 0,
@@ -169,6 +173,15 @@ class SoftActorCriticConfig(Hyperparameters):
             )
 
 
+def _usable(device: str) -> bool:
+    """Whether numbers can be drawn and computed there."""
+    try:
+        torch.randn(1, generator=torch.Generator(device), device=device).item()
+    except (RuntimeError, NotImplementedError, AssertionError):
+        return False
+    return True
+
+
 class SoftActorCritic(ABC):
     """Networks, optimisers and the order of Algorithm 1; a backend does the arithmetic.
 
@@ -188,6 +201,12 @@ class SoftActorCritic(ABC):
         seed: int,
         total_updates: int,
     ) -> None:
+        # A configuration may be resolved on one machine and trained on another.
+        config.require(
+            "device",
+            _usable(config.device),
+            "PyTorch finds no such device on this machine; use cpu, or install a build for it",
+        )
         self.config, self.d_min, self.total_updates = config, d_min, max(total_updates, 1)
         self.updates = 0
         options: dict[str, Any] = {"generator": generator(seed, 0), "device": config.device}
