@@ -136,6 +136,10 @@ class Agent(fac.Agent):
     def certificate_loss(self, batch: Batch, zeta: Tensor, multipliers: Tensor) -> Tensor:
         return certificate_loss(batch, multipliers, zeta, self.d_min, self.config)
 
+    def admitted(self, proposed: Tensor) -> Tensor:
+        """What zeta becomes where a step proposes a value in the box; here that value."""
+        return proposed
+
     def update_certificate(self, batch: Batch) -> Info:
         """A projected gradient step on zeta every m_phi updates (Algorithm 1, last line)."""
         if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
@@ -146,8 +150,8 @@ class Agent(fac.Agent):
         loss = self.certificate_loss(batch, zeta, multipliers)
         (gradient,) = torch.autograd.grad(loss, [zeta])
         left = (self.total_updates - self.updates) / (self.total_updates - self._first_update)
-        self.zeta.sub_(gradient, alpha=self._rate * max(left, 0.0))
-        torch.clamp(self.zeta, self._low, self._high, out=self.zeta)
+        moved = self.zeta.clone().sub_(gradient, alpha=self._rate * max(left, 0.0))
+        self.zeta.copy_(self.admitted(torch.clamp(moved, self._low, self._high)))
         names = self.config.energy_family.names
         return {
             "certificate_loss": loss.detach(),

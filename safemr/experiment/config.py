@@ -157,6 +157,7 @@ class Config:
     cost_tolerance: float
     zero_violation_share: float
     filters: Filters | None
+    sizes: bool  # whether certificates are compared with the least feasible one
 
 
 def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None) -> Config:
@@ -224,7 +225,10 @@ def parse(raw: Any) -> Config:
             safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
         filters=read_filters(top.get("filters"), top.required("algorithms"), tasks, seeds),
+        sizes=flag(top.get("sizes", False), "sizes"),
     )
+    if config.sizes and not config.unseen_layouts:
+        raise UserError("sizes: true draws returns on unseen layouts; say unseen_layouts, too")
     if config.log_points % config.evaluation.points:
         raise UserError(
             f"log_points = {config.log_points} must be a multiple of evaluation.points = "
@@ -250,7 +254,7 @@ _TOP_LEVEL = (
         "figures_root",
         "allow_missing",
     ),
-    *("wandb", "safe", "filters"),
+    *("wandb", "safe", "filters", "sizes"),
 )
 
 

@@ -34,6 +34,8 @@ VERSIONS = {
     "controllers": 1,
     "certificates": 1,
     "margins": 1,
+    "oracle": 1,
+    "encounters": 1,
     "rollouts": 1,
     "unseen_layouts": 1,
     "filters": 1,

@@ -1,0 +1,83 @@
+"""The sizes of certificates and what they are worth: the table of `safemr.measure.oracle`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from safemr.certificates.families import PAPER
+from safemr.measure.oracle import ORACLE
+from safemr.report import statistics
+from safemr.report.tables import ABSENT, FEW, Table, plus_minus
+
+
+def table(sizes: pd.DataFrame) -> Table:
+    """A row a task and certificate, those of one variant together.
+
+    sizes: `safemr.measure.oracle.measured_sizes`, or what was read of its CSV.
+    """
+    rows: list[dict[str, Any]] = []
+    named = sizes.assign(name=sizes["variant"].fillna(sizes["certificate"]))
+    for (task, name), part in named.groupby(["task", "name"], sort=False):
+        yardstick = named[(named["task"] == task) & (named["certificate"] == ORACLE)]
+        area = statistics.mean_interval(part["area"].to_numpy())
+        rows.append(
+            {
+                "task": task, "certificate": name, "runs": int(part["variant"].notna().sum()),
+                **{parameter: part[parameter].mean() for parameter in PAPER.names},
+                "area": area.mean, "area_low": area.low, "area_high": area.high,
+                "ratio": area.mean / float(yardstick["area"].iloc[0]),
+                "feasible": int((part["infeasible"] == 0).sum()), "certificates": len(part),
+                "infeasible_share": float((part["infeasible"] / part["encounters"]).max()),
+                "worst": float(part["worst"].max()),
+            }
+        )  # fmt: skip
+    data = pd.DataFrame(rows)
+    display = pd.DataFrame(
+        [
+            [
+                row["task"], row["certificate"], str(row["runs"] or ABSENT),
+                ", ".join(f"{row[parameter]:.3f}" for parameter in PAPER.names),
+                plus_minus(row["area"], row["area_low"], row["area_high"], 3),
+                f"{row['ratio']:.2f}",
+                f"{row['feasible']} of {row['certificates']}",
+                f"{100 * row['infeasible_share']:.4f}%",
+                ABSENT if np.isnan(row["worst"]) else f"{row['worst']:+.4f}",
+            ]
+            for row in rows
+        ],
+        columns=["task", "certificate", "runs", "[sigma, k, n]", "unsafe area (m²)",
+                 "of the oracle's", "feasible", "encounters without a safe action",
+                 "least g at the worst"],
+    )  # fmt: skip
+    caption = (
+        "How small a certificate may be. Unsafe area: {phi > 0} beyond d_min, averaged over the "
+        "motions that the robot reaches from rest and their directions. Feasible: in every such "
+        "motion, at every place of a grid around an obstacle, some action keeps the constraint; "
+        "the share and the least g are of the worst run. The oracle is the feasible member of the "
+        "paper's family with the least area, in the box in which the learners keep zeta."
+    )
+    return Table("sizes", caption, data, display, [FEW])
+
+
+def merged(sizes: pd.DataFrame, flown: Sequence[Path]) -> pd.DataFrame:
+    """Area and feasibility of every run's certificate with the return and the violating steps of
+    its final policy on unseen layouts: task, variant, seed, area, feasible, return, violating."""
+    runs = sizes.dropna(subset="variant")
+    scores = pd.concat([pd.read_csv(path) for path in flown], ignore_index=True)
+    wide = scores.pivot_table(
+        index=["task", "variant", "seed"], columns="metric", values="value"
+    ).reset_index()
+    found = runs.astype({"seed": int}).merge(wide, on=["task", "variant", "seed"])
+    return pd.DataFrame(
+        {
+            **{name: found[name] for name in ("task", "variant", "seed", "area")},
+            "feasible": found["infeasible"] == 0,
+            "return": found["eval_return"],
+            "violating": found["eval_cost_indicator"],
+        }
+    )

@@ -1,0 +1,47 @@
+# How small a certificate may be, and what its size is worth.
+from safemr.experiment.catalogue import declared_certificate
+
+SIZED = [
+    run
+    for run in PLAN.navigation
+    if CONFIG.sizes
+    and run in RECORDED
+    and run.task in ROBOT_TASKS
+    and declared_certificate(run.config["algorithm"]["name"]) == "energy"
+]
+SIZED_TASKS = [task for task in CONFIG.tasks if any(run.task == task for run in SIZED)]
+
+
+rule sizes:
+    input:
+        records=record_files(SIZED),
+        flown=expand(rules.unseen_layouts.output[0], task=SIZED_TASKS),
+    output:
+        sizes=f"{SUMMARY}/sizes.csv",
+        table=expand(f"{RESULTS}/tables/sizes.{{end}}", end=["csv", "tex"]),
+        markdown=report(
+            f"{RESULTS}/tables/sizes.md", caption="../report/sizes.rst", category="Tables"
+        ),
+        pdf=f"{FIGURES}/return_against_size.pdf",
+        png=report(
+            f"{FIGURES}/return_against_size.png",
+            caption="../report/sizes.rst",
+            category="Figures",
+        ),
+    log:
+        f"{LOGS}/sizes.log",
+    threads: 1
+    params:
+        root=RESULTS,
+        folders=[run.path.as_posix() for run in SIZED],
+        tasks=SIZED_TASKS,
+        lacking=without_policy(SIZED),
+        sources=sources("sizes"),
+    message:
+        "Looking for the least feasible certificates and measuring %d others" % len(SIZED)
+    script:
+        "../scripts/sizes.py"
+
+
+if SIZED:
+    TARGETS += [*rules.sizes.output]

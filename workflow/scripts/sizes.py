@@ -1,0 +1,21 @@
+"""How small certificates are, how small they may be, and what the policies behind them return."""
+
+from pathlib import Path
+
+from safemr.errors import reported_errors
+from safemr.measure.oracle import ORACLE, measured_sizes
+from safemr.measure.store import Measurements
+from safemr.report import sizes
+from safemr.report.figures import style
+from safemr.report.figures.sizes import against_size
+
+params, output = snakemake.params, snakemake.output
+with reported_errors():
+    found = measured_sizes(
+        Measurements(params.root), [Path(params.root, folder) for folder in params.folders]
+    )
+found.to_csv(output.sizes, index=False)
+sizes.table(found).write(Path(output.markdown).parent)
+yardsticks = found[found["certificate"] == ORACLE].set_index("task")["area"].to_dict()
+figure = against_size(sizes.merged(found, snakemake.input.flown), params.tasks, yardsticks)
+style.save(figure, Path(output.pdf).with_suffix(""))
