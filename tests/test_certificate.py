@@ -60,7 +60,8 @@ def test_algorithms_say_their_family() -> None:
     said = {
         name: catalogue.load_algorithm(name).certificate for name in catalogue.algorithm_names()
     }
-    energies = dict.fromkeys(("fac", "joint_sis", "safemr"), "energy")
+    papers = ("fac", "fac_oracle", "joint_sis", "safemr", "safemr_guarded")
+    energies = dict.fromkeys(papers, "energy")
     assert {name: family for name, family in said.items() if family} == {
         **energies,
         "neural_safemr": "neural",

@@ -22,7 +22,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
-from toy import ToyEnvs  # noqa: E402
+from toy import envs_for  # noqa: E402
 
 from safemr.experiment import planning, records  # noqa: E402
 
@@ -41,7 +41,9 @@ def fingerprint(name: str) -> dict[str, Any]:
     algorithm = planning.load_algorithm(name)
     fields = algorithm.hyperparameters.__dataclass_fields__
     small = {field: value for field, value in SMALL[algorithm.family].items() if field in fields}
-    trainer = algorithm.trainer(algorithm.hyperparameters(**small), ToyEnvs, 0, STEPS)
+    trainer = algorithm.trainer(
+        algorithm.hyperparameters(**small), envs_for(algorithm.name), 0, STEPS
+    )
     metrics = trainer.advance(STEPS)
     kept = {name: float(f"{value:.6g}") for name, value in metrics.items() if value == value}
     return {"version": algorithm.version, "metrics": kept}
@@ -87,7 +89,9 @@ def test_a_changed_hyperparameter_changes_the_fingerprint():
     name = "joint_sis"
     algorithm = planning.load_algorithm(name)
     small = {**SMALL["off_policy"], "critic_lr": 1.2e-3}
-    trainer = algorithm.trainer(algorithm.hyperparameters(**small), ToyEnvs, 0, STEPS)
+    trainer = algorithm.trainer(
+        algorithm.hyperparameters(**small), envs_for(algorithm.name), 0, STEPS
+    )
     stored, now = json.loads(FILE.read_text())[name]["metrics"], trainer.advance(STEPS)
     assert any(abs(now[m] - v) > TOLERANCE * max(abs(v), 1e-3) for m, v in stored.items())
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import torch
-from toy import ToyEnvs
+from toy import envs_for
 
 from safemr.errors import UserError
 from safemr.experiment import catalogue, listing, planning, train
@@ -68,7 +68,7 @@ def trained(algorithm: catalogue.Algorithm, values: dict[str, Any]) -> torch.Ten
     config = algorithm.hyperparameters(**small(algorithm))
     for name, value in values.items():
         object.__setattr__(config, name, value)
-    trainer = algorithm.trainer(config, ToyEnvs, 0, STEPS)
+    trainer = algorithm.trainer(config, envs_for(algorithm.name), 0, STEPS)
     trainer.advance(STEPS)
     return trainer.policy.network.parameters.detach().clone()
 

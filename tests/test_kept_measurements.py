@@ -29,7 +29,7 @@ from safemr import files
 from safemr.aircraft import neural, scoring
 from safemr.experiment import records
 from safemr.experiment.record import Record
-from safemr.measure import certify, controllers, evaluate, filters, store, trajectories
+from safemr.measure import certify, controllers, evaluate, filters, oracle, store, trajectories
 from safemr.measure.store import HEADER, Measurements
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -116,6 +116,11 @@ def behind_filters(again: Again) -> None:
     )
 
 
+def the_least_certificate(again: Again) -> None:
+    inputs = again.kept("unseen_layouts", f"{TASK}-FAC-oracle-seed*")[1]["inputs"]
+    oracle.measured_sizes(again.measurements, [again.record(inputs)])
+
+
 def the_frontier(again: Again) -> None:
     inputs = again.kept("aircraft_frontier", "frontier")[1]["inputs"]
     scoring.measured_frontier(again.measurements, again.sets(inputs["log2_states"]))
@@ -159,6 +164,7 @@ CASES: Mapping[Callable[[Again], None], tuple[Path, tuple[str, ...]]] = {
     the_rollouts: (RESULTS, ("rollouts",)),
     unseen_layouts: (RESULTS, ("unseen_layouts",)),
     behind_filters: (RESULTS, ("filters",)),
+    the_least_certificate: (RESULTS / "oracle", ("oracle", "encounters")),
     the_frontier: (RESULTS, ("aircraft_frontier",)),
     learners_and_references: (RESULTS, ("aircraft_learners", "aircraft_references")),
     the_slices: (RESULTS, ("aircraft_slices",)),
@@ -255,9 +261,9 @@ def test_the_repository_keeps_what_its_code_measures(
     """Otherwise VERSIONS was not raised with a change of the measuring code."""
     recorded, kinds = CASES[measure]
     measure(Again(recorded, tmp_path, solved))
-    made = {path.parent.name: path for path in (tmp_path / store.FOLDER).glob("*/*")}
-    assert made.keys() == set(kinds)
-    for kind, path in made.items():
+    made = [(path.parent.name, path) for path in (tmp_path / store.FOLDER).glob("*/*")]
+    assert {kind for kind, _ in made} == set(kinds)
+    for kind, path in made:
         kept = recorded / store.FOLDER / kind / path.name
         assert kept.exists(), f"{kind}: inputs or version are others than those kept: redraw"
         found = differences(content(path), content(kept))

@@ -7,6 +7,7 @@ the point) costs 1. Without the constraint the best place is 1.5; with it, just 
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import gymnasium
@@ -102,3 +103,16 @@ class ToyEnvs(VectorEnv):
         self._x = np.array(state["x"])
         self._steps = np.array(state["steps"])
         self._random.bit_generator.state = state["random"]
+
+
+# Algorithms that ask the model of the point robot, which the toy has not.
+OF_THE_ROBOT = ("fac_oracle", "safemr_guarded")
+
+
+def envs_for(algorithm: str) -> Any:
+    """What makes the environments that an algorithm is tried on: the toy where that will do."""
+    if algorithm not in OF_THE_ROBOT:
+        return ToyEnvs
+    from safemr.tasks import make_envs
+
+    return functools.partial(make_envs, "Pillars-0.15-Goal")

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import torch
 
 from safemr.algorithms import fac, joint_sis
-from safemr.certificates.families import PAPER
+from safemr.certificates.families import Parameters
 from safemr.certificates.oracle import Encounters, smallest
 from safemr.learning.contract import MakeEnvs
 
@@ -31,9 +31,13 @@ class Config(fac.Config):
     """FAC's hyperparameters; the certificate's are found."""
 
     UNUSED: ClassVar[Mapping[str, str]] = dict.fromkeys(
-        ("sigma", "k", "n", "family", "start", "family_version", "length_scale"),
-        "the certificate is looked for among the paper's, in metres",
+        fac.Config.PAPERS, "the certificate is looked for"
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require("start", not self.start, "not used: the certificate is looked for")
+        self.require("length_scale", self.length_scale == 1.0, "must be 1: metres are looked in")
 
 
 class Agent(fac.Agent):
@@ -46,7 +50,13 @@ class Trainer(fac.Trainer):
     def __init__(self, config: Any, make_envs: MakeEnvs, seed: int, total_steps: int) -> None:
         super().__init__(config, make_envs, seed, total_steps)
         envs: Any = self.envs
-        interface = self.interface
-        encounters = Encounters(envs.unwrapped, interface.action_repeat, interface.action_scale)
-        found = smallest(encounters, PAPER, joint_sis.Config().box, eta=config.eta)
-        self.agent.zeta.copy_(torch.tensor(list(found.zeta)))
+        envs, interface = envs.unwrapped, self.interface
+        key = (getattr(envs, "task", None), interface, config.family, config.eta)
+        if key not in _FOUND:
+            encounters = Encounters(envs, interface.action_repeat, interface.action_scale)
+            box = joint_sis.Config(family=config.family).box
+            _FOUND[key] = smallest(encounters, config.energy_family, box, eta=config.eta).zeta
+        self.agent.zeta.copy_(torch.tensor(list(_FOUND[key])))
+
+
+_FOUND: dict[Any, Parameters] = {}  # of this process, by task, decisions, family and eta
