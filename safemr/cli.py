@@ -3,6 +3,7 @@
 safemr train ...      train one run
 safemr evaluate ...   evaluate a recorded policy
 safemr certify ...    check a learned energy function
+safemr oracle ...     look for the least feasible certificate of a task
 safemr play RECORD .. draw an episode of a policy, with phi and the filter's interventions
 safemr records ...    verify the records under a results root and say what is unfinished
 safemr check-algorithm NAME  check that an algorithm keeps to the contract of a trainer
@@ -29,6 +30,7 @@ COMMANDS = {
     "train": "safemr.experiment.train",
     "evaluate": "safemr.measure.evaluate",
     "certify": "safemr.report.certificates",
+    "oracle": "safemr.report.sizes",
     "play": "safemr.report.play",
     "records": "safemr.experiment.overview",
     "check-algorithm": "safemr.experiment.check_algorithm",

@@ -12,7 +12,6 @@ from typing import Any
 
 import pandas as pd
 
-from safemr import paper
 from safemr.algorithms import joint_sis
 from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.falsification import make_simulator
@@ -23,8 +22,14 @@ from safemr.experiment.catalogue import declared_certificate
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
 from safemr.learning.interface import Interface
-from safemr.measure.certify import certificate_of_record, decisions_of
+from safemr.measure.certify import (
+    DEFAULT_TASK,
+    certificate_of_record,
+    decisions_of,
+    paper_certificates,
+)
 from safemr.measure.store import Measurements
+from safemr.paper import PHI_0, PHI_H
 from safemr.tasks import Task, name_of
 
 ORACLE = "oracle"  # the certificate's name in tables
@@ -32,7 +37,6 @@ GRID = {"cell": list(CELL), "bearings": BEARINGS, "spacing": SPACING}
 SEARCH = {"points": POINTS, "zooms": ZOOMS}
 COLUMNS = ("task", "certificate", "variant", "seed", *PAPER.names, "area", "encounters",
            "infeasible", "worst")  # fmt: skip
-REFERENCES = {"phi_h": paper.PHI_H, "phi_0": paper.PHI_0}
 
 
 class Yardstick:
@@ -94,10 +98,16 @@ class Yardstick:
             "task": name_of(self.task), "certificate": certificate.name, **zeta._asdict(), **kept
         }  # fmt: skip
 
+    def references(self, measurements: Measurements) -> list[dict[str, Any]]:
+        """Rows of the oracle, phi_h and phi_0, on the task of Table II of its learned sets, too."""
+        of_table = name_of(self.task) == DEFAULT_TASK
+        papers = [c for c in paper_certificates() if of_table or c.zeta in (PHI_H, PHI_0)]
+        return [self.row(measurements, c) for c in (self.oracle(measurements), *papers)]
+
 
 def measured_sizes(measurements: Measurements, folders: Sequence[Path]) -> pd.DataFrame:
-    """One row a certificate, of `COLUMNS`: of each task of the records the oracle, phi_h, phi_0,
-    then the records' own.
+    """One row a certificate, of `COLUMNS`: of each task of the records the references, then the
+    records' own.
 
     All are judged over decisions as the records of the task make them. Records without a
     certificate of the paper's family give no row; ``variant`` and ``seed`` are those of a record.
@@ -116,9 +126,7 @@ def measured_sizes(measurements: Measurements, folders: Sequence[Path]) -> pd.Da
         key = (name_of(record.task), interface)
         if key not in yardsticks:
             yardsticks[key] = yardstick = Yardstick(record.task, interface)
-            references = [EnergyCertificate(name, zeta) for name, zeta in REFERENCES.items()]
-            for reference in (yardstick.oracle(measurements), *references):
-                rows.append(yardstick.row(measurements, reference))
+            rows += yardstick.references(measurements)
         row = yardsticks[key].row(measurements, certificate)
         learned.append({**row, "variant": record.variant, "seed": record.seed})
     return pd.DataFrame([*rows, *learned], columns=COLUMNS)

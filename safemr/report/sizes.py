@@ -1,7 +1,9 @@
-"""The sizes of certificates and what they are worth: the table of `safemr.measure.oracle`."""
+"""``safemr oracle``: the sizes of certificates beside the least that is feasible, as a table."""
 
 from __future__ import annotations
 
+import argparse
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,8 +11,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.families import PAPER
-from safemr.measure.oracle import ORACLE
+from safemr.errors import UserError
+from safemr.experiment.planning import describe_task
+from safemr.experiment.strict_yaml import assignment
+from safemr.learning.interface import Interface
+from safemr.measure.certify import DEFAULT_TASK
+from safemr.measure.oracle import COLUMNS, ORACLE, Yardstick
+from safemr.measure.store import Measurements
 from safemr.report import statistics
 from safemr.report.tables import ABSENT, FEW, Table, plus_minus
 
@@ -81,3 +90,36 @@ def merged(sizes: pd.DataFrame, flown: Sequence[Path]) -> pd.DataFrame:
             "violating": found["eval_cost_indicator"],
         }
     )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`safemr oracle`; prints the table of a task's references and of a certificate given."""
+    parser = argparse.ArgumentParser(
+        prog="safemr oracle", description="the least feasible certificate of a task, and others"
+    )
+    parser.add_argument("--task", default=DEFAULT_TASK, help=f"default {DEFAULT_TASK}")
+    parser.add_argument("--set", action="append", default=[], metavar="interface.NAME=VALUE",
+                        help="of the decisions, such as interface.action_repeat=5")  # fmt: skip
+    for name in PAPER.names:
+        parser.add_argument(f"--{name}", type=float, help="of a certificate to compare, in metres")
+    options = parser.parse_args(arguments)
+    settings = dict(map(assignment, options.set))
+    for name in settings:
+        if not name.startswith("interface."):
+            raise UserError(
+                f"--set {name}: only decisions have settings here: interface.NAME=VALUE"
+            )
+    entry = {name.removeprefix("interface."): value for name, value in settings.items()}
+    zeta = [getattr(options, name) for name in PAPER.names]
+    if None in zeta and any(value is not None for value in zeta):
+        raise UserError("--sigma, --k and --n belong together: give all three")
+    task = describe_task(options.task, {}, "--task")
+    yardstick = Yardstick(task, Interface.read(entry or None))
+    with tempfile.TemporaryDirectory() as folder:
+        measurements = Measurements(folder)
+        rows = yardstick.references(measurements)
+        if None not in zeta:
+            given = EnergyCertificate("given", PAPER.at(zeta))
+            rows.append(yardstick.row(measurements, given))
+    print(table(pd.DataFrame(rows, columns=COLUMNS)).markdown())
+    return 0
