@@ -226,6 +226,7 @@ WRONG: dict[tuple[str, ...], list[Any]] = {
     ("results_root",): NOT_A_ROOT,
     ("figures_root",): NOT_A_ROOT,
     ("allow_missing",): ["yes", 1, 0, None, [], "true"],
+    ("sizes",): ["yes", 1, 0, None, [], "true"],
     ("wandb",): [None, *NOT_A_MAPPING, {"modes": "online"}],
     ("wandb", "mode"): [None, True, "on", "Online", ["online"], 3],
     ("wandb", "project"): NOT_A_NAME,
@@ -477,6 +478,7 @@ CHANGES: list[tuple[tuple[str, ...], Any, int]] = [
     (("interface",), {"action_repeat": 1}, 0),
     (("unseen_layouts", "episodes"), 50, 0),
     (("filters", "episodes"), 50, 0),
+    (("sizes",), True, 0),
     (("wandb", "mode"), "offline", 0),
     (("safe", "cost_tolerance"), 2.0, 0),
     (("figures_root",), "elsewhere", 0),
@@ -665,3 +667,9 @@ def test_plans_are_remembered_until_something_changes(
     (tmp_path / "results/.work/plan.json").write_text("{")
     assert plan_for(config.parse(VALID)) == first
     assert len(calls) == 4
+
+
+def test_sizes_are_drawn_against_flights_on_unseen_layouts() -> None:
+    assert config.parse(VALID | {"sizes": True}).sizes
+    with pytest.raises(UserError, match="say unseen_layouts, too"):
+        config.parse(VALID | {"sizes": True, "unseen_layouts": None})

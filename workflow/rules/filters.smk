@@ -29,6 +29,12 @@ rule filters:
             caption="../report/filters.rst",
             category="Tables",
         ),
+        pdf=f"{FIGURES}/filters.pdf",
+        png=report(
+            f"{FIGURES}/filters.png",
+            caption="../report/filters.rst",
+            category="Figures",
+        ),
     log:
         f"{LOGS}/filters.log",
     threads: 1

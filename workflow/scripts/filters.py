@@ -7,6 +7,8 @@ import pandas as pd
 from safemr.errors import reported_errors
 from safemr.measure import filters
 from safemr.measure.store import Measurements
+from safemr.report.figures import style
+from safemr.report.figures.filters import behind_filters
 from safemr.report.filters import table
 
 params = snakemake.params
@@ -30,3 +32,4 @@ with reported_errors():
 scores = pd.concat(flown, ignore_index=True)
 scores.to_csv(snakemake.output.scores, index=False)
 table(scores, episodes=params.episodes).write(Path(snakemake.output.markdown).parent)
+style.save(behind_filters(scores), Path(snakemake.output.pdf).with_suffix(""))

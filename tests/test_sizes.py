@@ -1,0 +1,102 @@
+"""The table and the pictures of what certificates of other sizes are worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from safemr import cli
+from safemr.measure.oracle import COLUMNS
+from safemr.report import sizes
+from safemr.report.figures.filters import behind_filters
+from safemr.report.figures.sizes import against_size
+
+TASK = "Pillars-0.15-Goal"
+
+
+def certificates() -> pd.DataFrame:
+    """The oracle, and two variants of which one has a run that is not feasible."""
+
+    def row(name: str, area: float, infeasible: int = 0, variant: str | None = None,
+            seed: int | None = None) -> tuple[object, ...]:  # fmt: skip
+        worst = 0.01 * infeasible if infeasible else np.nan
+        return TASK, name, variant, seed, 0.1, 1.0, 2.0, area, 1000, infeasible, worst
+
+    rows = [row("oracle", 0.5), row("phi_h", 1.5, 2)]
+    rows += [row(f"A (seed {seed})", 1.0 + seed, seed == 2, "A", seed) for seed in range(3)]
+    rows += [row("B (seed 0)", 0.75, 0, "B", 0)]
+    return pd.DataFrame(rows, columns=list(COLUMNS))
+
+
+def test_the_table_has_a_row_a_variant_and_the_oracle_as_its_unit() -> None:
+    data = sizes.table(certificates()).data.set_index("certificate")
+    assert list(data.index) == ["oracle", "phi_h", "A", "B"]
+    assert data["ratio"].tolist() == pytest.approx([1.0, 3.0, 4.0, 1.5])
+    assert data["feasible"].tolist() == [1, 0, 2, 1]
+    assert data.loc["A", "infeasible_share"] == pytest.approx(0.001)
+    assert data.loc["A", "runs"] == 3
+    assert np.isnan(data.loc["B", "area_low"])  # one run has no interval
+
+
+def scores(path: Path) -> Path:
+    rows = [
+        (TASK, variant, seed, metric, value)
+        for variant, seed in [("A", 0), ("A", 1), ("A", 2), ("B", 0), ("PPO-L", 0)]
+        for metric, value in [("eval_return", 10.0 + seed), ("eval_cost_indicator", 0.1 * seed)]
+    ]
+    pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"]).to_csv(path)
+    return path
+
+
+def test_runs_meet_their_flights(tmp_path: Path) -> None:
+    points = sizes.merged(certificates(), [scores(tmp_path / "flown.csv")])
+    assert len(points) == 4  # PPO-L has no certificate, phi_h no flight
+    assert points.set_index(["variant", "seed"]).loc[("A", 2), "return"] == 12.0
+    assert points["feasible"].tolist() == [True, True, False, True]
+    figure = against_size(points, [TASK], {TASK: 0.5})
+    upper = figure.axes[0]
+    drawn = [line for line in upper.lines if line.get_marker() not in ("None", None, "")]
+    assert sum(len(line.get_xdata()) for line in drawn) == 4
+    hollow = [line for line in drawn if line.get_markerfacecolor() == "none"]
+    assert [line.get_xdata().tolist() for line in hollow] == [[3.0]]
+
+
+def test_the_filters_figure_shows_every_flight() -> None:
+    rows = [
+        (TASK, policy, name, seed, metric, value)
+        for policy in ("PPO-L", "CPO")
+        for name in (None, "phi_h", "SafeMR")
+        for seed in (0, 1)
+        for metric, value in [("return", 1.0 + seed), ("zero_violation_share", 0.5)]
+    ]
+    columns = ["task", "variant", "filter", "seed", "metric", "value"]
+    figure = behind_filters(pd.DataFrame(rows, columns=columns))
+    left, right = figure.axes
+    small = [line for line in left.lines if len(line.get_xdata()) == 2 and line.get_alpha()]
+    assert len(small) == 6
+    assert [text.get_text() for text in left.get_yticklabels()] == ["PPO-L", "CPO"]
+    dirty = {float(x) for line in right.lines if line.get_alpha() for x in line.get_xdata()}
+    assert dirty == {50.0}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--sigma", "0.1"], "belong together"),
+        (["--set", "task.d_min=1"], "only decisions have settings here"),
+        (["--set", "interface.action_repeat=0"], "action_repeat must be"),
+        (["--task", "Pillars-0.2-Goal"], "did you mean"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["oracle", *arguments])
+    assert ended.value.code == 2
+    printed = capsys.readouterr().err
+    assert said in printed
+    assert printed.count("\n") == 1
