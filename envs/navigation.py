@@ -19,7 +19,8 @@ from envs.contract import (
     checked_limit,
     checked_render_mode,
 )
-from envs.navigation_batch import NavigationBatch, Scene
+from envs.navigation_batch import NavigationBatch
+from envs.scene import Scene
 from envs.rendering import FrameRenderer
 from envs.tasks import REGISTERED_TASKS, NavigationTask
 

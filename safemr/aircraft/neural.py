@@ -30,6 +30,7 @@ from safemr.certificates.families import PAPER, named
 from safemr.conventions import COVERS
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
+from safemr.learning.adam import Adam
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.measure.store import VERSIONS, Measurements
@@ -101,7 +102,7 @@ def fit_to_truth(
         torch.from_numpy(values[:, None]).float()
         for values in (dynamics.separation(states), dynamics.separation_rate(states))
     )
-    adam = torch.optim.Adam([network.parameters], lr=lr, fused=True)
+    adam = Adam([network.parameters], lr)
     for step in range(steps):
         adam.param_groups[0]["lr"] = lr * (1.0 - step / steps)
         rows = torch.randint(len(states), (batch,), generator=generator)
