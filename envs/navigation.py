@@ -20,8 +20,8 @@ from envs.contract import (
     checked_render_mode,
 )
 from envs.navigation_batch import NavigationBatch
-from envs.scene import Scene
 from envs.rendering import FrameRenderer
+from envs.scene import Scene
 from envs.tasks import REGISTERED_TASKS, NavigationTask
 
 Array = NDArray[np.float64]

@@ -58,9 +58,7 @@ class FusedSteps:
         """The critics' values [2, B, 1]."""
         return torch.from_numpy(kernels.evaluate(self._critics, observations.numpy())).mT
 
-    def value_step(
-        self, batch: Batch, indices: Tensor | slice, optimizer: Adam
-    ) -> Tensor:
+    def value_step(self, batch: Batch, indices: Tensor | slice, optimizer: Adam) -> Tensor:
         """One step of both critics on a minibatch; their losses before it, [2]."""
         (state,), lr = _adam(optimizer)
         samples = (batch.observations.numpy(), batch.returns.numpy(), _rows(batch, indices))

@@ -77,9 +77,7 @@ def animation(
     steps = min([steps, *(len(data["robot"]) - 1 for data in recorded.values())])
     shown = range(0, steps + 1, stride)
     frames = (
-        _frames(recorded, draw_scene, episode, shown, pixels)
-        if recorded
-        else [_pixels(_nothing())]
+        _frames(recorded, draw_scene, episode, shown, pixels) if recorded else [_pixels(_nothing())]
     )
     width, height = frames[0].size
     sample = Image.new("RGB", (width, 3 * height))
