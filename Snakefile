@@ -23,6 +23,16 @@ include: "workflow/rules/sensitivity.smk"
 include: "workflow/rules/aircraft.smk"
 
 
+onstart:
+    # While jobs wait for a core Snakemake looks at all of them and their inputs every second, once
+    # more for each job that has finished, to hold a limit of 100 starts a second that is of no use
+    # here; and it solves a linear program to choose among jobs of one core each.
+    # These are internals: where a later version has none of that name, it goes on as it would.
+    workflow.scheduler.job_rate_limiter = None
+    if hasattr(workflow.scheduler, "job_selector_greedy"):
+        workflow.scheduler._job_selector = workflow.scheduler.job_selector_greedy
+
+
 onerror:
     print(f"What is complete, and why the rest is not, says: safemr records {RESULTS}")
     print(

@@ -241,10 +241,12 @@ def pip(folder: Path, *arguments: str) -> str:
 def write_lock() -> int:
     """Resolve pyproject.toml in a throw-away environment and write down what was chosen."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    extras = project["project"]["optional-dependencies"]
     wanted = [
         *project["project"]["dependencies"],
-        *project["project"]["optional-dependencies"]["test"],
-        *project["project"]["optional-dependencies"]["wandb"],  # a setting of the configuration
+        *extras["pipeline"],
+        *extras["test"],
+        *extras["wandb"],  # a setting of the configuration
         *project["build-system"]["requires"],
     ]
     with tempfile.TemporaryDirectory() as scratch:

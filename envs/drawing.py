@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.navigation_batch import Scene
+from envs.scene import Scene
 from envs.tasks import ROBOT_RADIUS
 
 if TYPE_CHECKING:

@@ -19,8 +19,9 @@ from envs.contract import (
     checked_limit,
     checked_render_mode,
 )
-from envs.navigation_batch import NavigationBatch, Scene
+from envs.navigation_batch import NavigationBatch
 from envs.rendering import FrameRenderer
+from envs.scene import Scene
 from envs.tasks import REGISTERED_TASKS, NavigationTask
 
 Array = NDArray[np.float64]

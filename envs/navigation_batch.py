@@ -6,7 +6,6 @@ The Gymnasium environments of envs/navigation.py, scalar and batched, are thin s
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,23 +16,12 @@ from envs.contract import Independent
 from envs.layout import sample_goal, sample_layout
 from envs.navigation_kernels import SCORES, observation_blocks, observe, score, task_distances
 from envs.navigation_physics import Worlds
+from envs.scene import Scene
 from envs.tasks import NavigationTask
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Info = dict[str, NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What a drawing needs of one world: positions in m, angles in rad, world frame."""
-
-    task: NavigationTask
-    robot: Array  # [3] x, y, heading
-    goal: Array  # [2]
-    obstacles: Array  # [M, 2]
-    box: Array | None  # [3] x, y, yaw
-    vase: Array | None  # [3] x, y, yaw
 
 
 class NavigationBatch(Independent):

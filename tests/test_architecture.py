@@ -162,7 +162,7 @@ def test_a_planted_violation_is_found(tmp_path: Path) -> None:
             "safemr.experiment.plan_cache",
             "safemr.cli",
         ),
-        *("safemr.report.statistics", "safemr.report.tables"),
+        *(f"safemr.report.{path.stem}" for path in (ROOT / "safemr/report").glob("[a-z]*.py")),
         *(
             f"safemr.report.figures.{path.stem}"
             for path in (ROOT / "safemr/report/figures").glob("[a-z]*.py")
@@ -176,6 +176,10 @@ def test_reading_and_drawing_need_no_torch(module: str) -> None:
 def test_building_the_workflow_needs_neither_torch_nor_a_simulator() -> None:
     names = reached("safemr.experiment.plan_cache")
     assert not names & {"torch", "mujoco", "gymnasium", "numba", "pandas", "matplotlib"}
+
+
+def test_drawing_a_scene_needs_neither_a_simulator_nor_compiled_code() -> None:
+    assert not reached("envs.drawing") & {"mujoco", "numba", "envs.compiled", "matplotlib"}
 
 
 def test_energy_has_one_home() -> None:

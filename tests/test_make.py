@@ -330,6 +330,6 @@ def test_the_lock_holds_what_the_pipeline_and_the_tests_need_extras_included(
     monkeypatch.setattr(make, "pip", pip)
     monkeypatch.setattr(make, "LOCK", tmp_path / "requirements.lock")
     assert make.main(["lock"]) == 0
-    for package in ("numpy", "pytest", "wandb", "setuptools"):
+    for package in ("numpy", "snakemake", "pytest", "wandb", "setuptools"):
         assert any(need.startswith(f"{package}>=") for need in asked), package
     assert make.LOCK.read_text() == make.HEADER + "numpy==2.0.0\n"

@@ -15,7 +15,8 @@ import pytest
 
 import envs  # noqa: F401  (registers the tasks)
 from envs.layout import LayoutError
-from envs.tasks import NAVIGATION_TASKS, NavigationTask
+from envs.scene import first_scene
+from envs.tasks import NAVIGATION_TASKS, REGISTERED_TASKS, NavigationTask
 
 TASKS = sorted(NAVIGATION_TASKS)
 
@@ -179,3 +180,19 @@ def test_training_imports_neither_opengl_nor_matplotlib() -> None:
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", REGISTERED_TASKS)
+def test_the_first_scene_needs_no_simulator(name: str) -> None:
+    """That of a task drawn from its layout alone is that of an episode's start."""
+    env = gymnasium.make(f"{name}-v0").unwrapped
+    env.reset(seed=3)
+    drawn, simulated = first_scene(REGISTERED_TASKS[name], 3), env.scene()
+    assert (drawn.task, drawn.box is None) == (simulated.task, simulated.box is None)
+    for part in ("robot", "goal", "obstacles", "box", "vase"):
+        ours, theirs = getattr(drawn, part), getattr(simulated, part)
+        assert (ours is None) == (theirs is None)
+        if ours is not None:
+            np.testing.assert_allclose(ours[..., :2], theirs[..., :2], rtol=0, atol=1e-12)
+            turned = ours[2:] - theirs[2:] if part in ("robot", "box", "vase") else 0.0
+            np.testing.assert_allclose(np.cos(turned), 1.0, rtol=0, atol=1e-12)

@@ -12,6 +12,7 @@ import torch
 
 from safemr.algorithms import fac, joint_sis, sac_lagrangian, safemr
 from safemr.learning import numba_kernels, numba_steps
+from safemr.learning.adam import Adam
 from safemr.learning.networks import ACTIVATIONS, StackedMLP
 from safemr.learning.replay import Batch, Replay
 from safemr.learning.soft_actor_critic import SoftActorCritic
@@ -170,7 +171,7 @@ def test_gradients_of_a_stack(activation: str) -> None:
 def test_adam_is_that_of_torch() -> None:
     rng = torch.Generator().manual_seed(0)
     mine, theirs = (torch.linspace(-1, 1, 50).requires_grad_(True) for _ in range(2))
-    ours, reference = (torch.optim.Adam([values], lr=0.01) for values in (mine, theirs))
+    ours, reference = Adam([mine], 0.01), torch.optim.Adam([theirs], lr=0.01)
     for step in range(100):
         grad = torch.randn(50, generator=rng) * 10.0 ** (step % 5 - 3)
         numba_kernels.adam(mine.detach().numpy(), grad.numpy(), numba_steps.optimiser(ours), 0.01)

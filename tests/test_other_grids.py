@@ -87,10 +87,8 @@ def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> Non
     names += ["aggregate_scores", "aggregate_safe_scores"] * bool(papers)
     pdf = [str(tmp_path / f"{name}.pdf") for name in names]
     run_script("final_scores", input=given, params=grid, output={"pdf": pdf})
-    for name in ("training_curves", "compute_curves"):
-        path = str(tmp_path / f"{name}.pdf")
-        output = {"pdf": path if name == "training_curves" else [path]}
-        run_script(name, input=given, params=grid, output=output)
+    pdf = [str(tmp_path / f"{name}.pdf") for name in ("training_curves", "compute_curves")]
+    run_script("curves", input=given, params=grid, output={"pdf": pdf})
     drawn = {path.stem for path in tmp_path.glob("*.png")}
     assert drawn == {*names, "training_curves", "compute_curves"}
     params = {**grid, "expected": expected, "baselines": ["CPO"], "push": [], "layouts": 7}
@@ -212,7 +210,7 @@ def test_only_what_makes_sense_is_scheduled(checkout: Checkout) -> None:  # noqa
     assert not {"sensitivity", "unseen_table", "aircraft_comparison"} & {*scheduled}
     checkout.configure(tasks=["Aircraft"], **NOTHING_ELSE)
     scheduled = checkout.scheduled()
-    assert {"training_curves", "final_scores", "claims", "parameters"} <= {*scheduled}
+    assert {"curves", "final_scores", "claims"} <= {*scheduled}
     assert not {"illustrations", "certificates", "rollouts", "policies"} & {*scheduled}
 
 

@@ -65,7 +65,7 @@ def test_what_importing_a_script_loads_was_found_without_importing() -> None:
 
 
 def test_drawing_and_tables_depend_on_nothing_that_trains() -> None:
-    for name in ("training_curves", "tables", "claims", "final_scores", "weight_map", "parameters"):
+    for name in ("curves", "tables", "claims", "final_scores", "weight_map"):
         files = sources.reached(ROOT / f"workflow/scripts/{name}.py").files
         names = {path.relative_to(ROOT).as_posix() for path in files}
         assert not [n for n in names if n.startswith(("envs/", "safemr/algorithms/"))]

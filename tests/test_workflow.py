@@ -158,7 +158,7 @@ def test_what_is_recorded_can_be_drawn_without_training(checkout: Checkout) -> N
 
 def test_an_edit_makes_again_what_depends_on_it_and_only_that(checkout: Checkout) -> None:
     checkout.fill_in_records()
-    made = ("table_1", "training_curves", "illustrations")
+    made = ("table_1", "curves", "illustrations")
     checkout.snakemake(*made)
 
     def edited(*sources: str) -> dict[str, int]:
@@ -181,8 +181,8 @@ def test_an_edit_makes_again_what_depends_on_it_and_only_that(checkout: Checkout
     assert edited(*algorithms) == {}
     drawing = ("safemr/report/figures/certificate.py", "safemr/report/differences.py")
     assert edited(*drawing) == {"illustrations": 1, "table_1": 1}
-    everything = {"aggregate": 1, "controllers": 1, **dict.fromkeys(made, 1)}
-    assert edited("safemr/experiment/records.py") == everything
+    of_records = dict.fromkeys(("aggregate", "controllers", "table_1", "curves"), 1)
+    assert edited("safemr/experiment/records.py") == of_records
     assert checkout.scheduled(targets=made) == {}
 
 
@@ -206,7 +206,7 @@ def test_a_clone_draws_everything_once_and_then_nothing(checkout: Checkout) -> N
     As `git clone` and an archive have it: the scripts are not older than any output.
     """
     checkout.fill_in_records()
-    made = ("table_1", "training_curves")
+    made = ("table_1", "curves")
     checkout.snakemake(*made)
     shutil.rmtree(checkout.folder / ".snakemake")
     tracked = [*checkout.folder.glob("results/**/*"), *checkout.folder.glob("paper_figures/*")]

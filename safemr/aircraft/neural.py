@@ -22,7 +22,7 @@ from safemr import paper
 from safemr.aircraft import reachability, scoring, unsafe_sets
 from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
-from safemr.aircraft.scoring import TrueSets, learners
+from safemr.aircraft.scoring import CONTROL, TrueSets, learners
 from safemr.aircraft.slices import Slice
 from safemr.aircraft.unsafe_sets import Energy, Truth, of_states
 from safemr.algorithms.neural_safemr import NeuralCertificate, neural_energy
@@ -30,12 +30,12 @@ from safemr.certificates.families import PAPER, named
 from safemr.conventions import COVERS
 from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
+from safemr.learning.adam import Adam
 from safemr.learning.networks import StackedMLP
 from safemr.learning.observation import ObservationTransform
 from safemr.measure.store import VERSIONS, Measurements
 from safemr.measure.tracks import below
 
-CONTROL = "fit to the truth"
 CONTROL_SHARES = (0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4)
 SLICE, SPACING = 180.0, 0.1  # [degree], [m] of the plane that is drawn
 LOG2_STATES = 17  # Sobol points of the comparison: volumes are right to 0.1 %
@@ -101,7 +101,7 @@ def fit_to_truth(
         torch.from_numpy(values[:, None]).float()
         for values in (dynamics.separation(states), dynamics.separation_rate(states))
     )
-    adam = torch.optim.Adam([network.parameters], lr=lr, fused=True)
+    adam = Adam([network.parameters], lr)
     for step in range(steps):
         adam.param_groups[0]["lr"] = lr * (1.0 - step / steps)
         rows = torch.randint(len(states), (batch,), generator=generator)

@@ -53,6 +53,7 @@ CERTIFICATES: Mapping[str, tuple[float, float, float]] = {
     "code init": (0.3, 1.0, 1.0),
 }
 TRUE_SET, ADVERSARIAL_SET, STRAIGHT = "true set", "true set, adversarial", "straight flight"
+CONTROL = "fit to the truth"  # what `safemr.aircraft.neural` holds against the learners
 COLUMNS = ("volume_ratio", "missed_share", "iou", "infeasible_share", "infeasible_share_eta",
            "leak_share")  # fmt: skip
 

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from safemr.learning import on_policy
+from safemr.learning.adam import Adam
 from safemr.learning.contract import MakeEnvs
 from safemr.learning.gaussian import ratio_and_kl
 from safemr.learning.lagrange import Multiplier, MultiplierConfig, penalised
@@ -81,9 +82,7 @@ class Trainer(OnPolicyTrainer):
     def __init__(self, config: Config, make_envs: MakeEnvs, seed: int, total_steps: int) -> None:
         super().__init__(config, make_envs, seed, total_steps)
         self.multiplier = Multiplier(config)
-        self.policy_optimizer = torch.optim.Adam(
-            self.actor.parameters, lr=config.policy_lr, fused=True
-        )
+        self.policy_optimizer = Adam(self.actor.parameters, config.policy_lr)
 
     def update_policy(self, batch: Batch) -> dict[str, float]:
         self.multiplier.update(batch.episode_cost, self.config.cost_limit)

@@ -16,6 +16,8 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
+from safemr.learning.adam import Adam
+
 MultiplierOptimizer = Literal["adam", "sgd"]
 
 
@@ -53,8 +55,11 @@ class Multiplier:
         # log(exp(x) - 1) inverts softplus; written so that a large x does not overflow
         raw = initial + math.log(-math.expm1(-max(initial, 1e-8)))
         self.raw = torch.tensor(raw, dtype=torch.float64, requires_grad=True)
-        kind = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[config.multiplier_optimizer]
-        self.optimizer: torch.optim.Optimizer = kind([self.raw], lr=config.multiplier_lr)
+        self.optimizer: Adam | torch.optim.SGD
+        if config.multiplier_optimizer == "adam":
+            self.optimizer = Adam([self.raw], config.multiplier_lr, fused=False)
+        else:
+            self.optimizer = torch.optim.SGD([self.raw], lr=config.multiplier_lr)
 
     @property
     def value(self) -> float:

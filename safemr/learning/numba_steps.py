@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from safemr.learning import numba_kernels
+from safemr.learning.adam import Adam
 from safemr.learning.losses import Info
 from safemr.learning.networks import ACTIVATIONS, StackedMLP
 from safemr.learning.replay import Batch
@@ -29,22 +30,18 @@ def network(stack: StackedMLP) -> numba_kernels.Network:
     )
 
 
-def optimisers(adam: torch.optim.Adam) -> list[numba_kernels.Optimiser]:
-    """The state of an Adam for each of its tensors, created as its own first step would do it."""
+def optimisers(adam: Adam) -> list[numba_kernels.Optimiser]:
+    """The state of an Adam for each of its tensors."""
     (group,) = adam.param_groups
     found = []
     for parameters in group["params"]:
-        state = adam.state[parameters]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["exp_avg"] = torch.zeros_like(parameters)
-            state["exp_avg_sq"] = torch.zeros_like(parameters)
-        moments = (state[name].detach().view(-1) for name in ("exp_avg", "exp_avg_sq", "step"))
+        state = adam.moments(parameters)
+        moments = (state[name].view(-1) for name in ("exp_avg", "exp_avg_sq", "step"))
         found.append(numba_kernels.Optimiser(*(moment.numpy() for moment in moments)))
     return found
 
 
-def optimiser(adam: torch.optim.Adam) -> numba_kernels.Optimiser:
+def optimiser(adam: Adam) -> numba_kernels.Optimiser:
     """The state of an Adam over one tensor."""
     (only,) = optimisers(adam)
     return only

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from safemr.learning.adam import Adam
 from safemr.learning.contract import MakeEnvs, check_finite, environment_seed, generator
 from safemr.learning.episode_statistics import EpisodeStatistics
 from safemr.learning.gaussian import GaussianActor, entropy, log_density, ratio_and_kl
@@ -135,9 +136,7 @@ class OnPolicyTrainer(ABC):
         )
         self.actor = GaussianActor(network, torch.full((actions,), config.initial_log_std))
         self.critics = StackedMLP(2, (*sizes, 1), config.activation, generator=weights)
-        self.critic_optimizer = torch.optim.Adam(
-            [self.critics.parameters], lr=config.value_lr, fused=True
-        )
+        self.critic_optimizer = Adam([self.critics.parameters], config.value_lr)
         self.fused = self._fused() if config.backend == "fused" else None
         self.noise, self.order = generator(seed, 1), generator(seed, 2)
         self.rollout = Rollout(

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from safemr.learning import on_policy_kernels as kernels
+from safemr.learning.adam import Adam
 from safemr.learning.gaussian import GaussianActor
 from safemr.learning.networks import StackedMLP
 from safemr.learning.numba_kernels import Floats, Optimiser
@@ -28,7 +29,7 @@ def _rows(batch: Batch, indices: Tensor | slice) -> kernels.Rows:
     return np.arange(len(batch.actions)) if isinstance(indices, slice) else indices.numpy()
 
 
-def _adam(optimizer: torch.optim.Adam) -> tuple[list[Optimiser], float]:
+def _adam(optimizer: Adam) -> tuple[list[Optimiser], float]:
     """The states of its tensors, which loading a checkpoint replaces, and its learning rate."""
     return optimisers(optimizer), float(optimizer.param_groups[0]["lr"])
 
@@ -57,9 +58,7 @@ class FusedSteps:
         """The critics' values [2, B, 1]."""
         return torch.from_numpy(kernels.evaluate(self._critics, observations.numpy())).mT
 
-    def value_step(
-        self, batch: Batch, indices: Tensor | slice, optimizer: torch.optim.Adam
-    ) -> Tensor:
+    def value_step(self, batch: Batch, indices: Tensor | slice, optimizer: Adam) -> Tensor:
         """One step of both critics on a minibatch; their losses before it, [2]."""
         (state,), lr = _adam(optimizer)
         samples = (batch.observations.numpy(), batch.returns.numpy(), _rows(batch, indices))
@@ -69,7 +68,7 @@ class FusedSteps:
         self,
         batch: Batch,
         indices: Tensor | slice,
-        optimizer: torch.optim.Adam,
+        optimizer: Adam,
         clip: float,
         multiplier: float,
         bound: float,

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from safemr.learning.adam import Adam
 from safemr.learning.contract import generator
 from safemr.learning.hyperparameters import Hyperparameters, Setting
 from safemr.learning.losses import REWARD_CRITICS, Info, reward_target
@@ -236,8 +237,8 @@ class SoftActorCritic(ABC):
         self.backend = self._make_backend()
 
     @staticmethod
-    def adam(parameters: Tensor, lr: float) -> torch.optim.Adam:
-        return torch.optim.Adam([parameters], lr=lr, fused=True)
+    def adam(parameters: Tensor, lr: float) -> Adam:
+        return Adam([parameters], lr)
 
     def _make_backend(self) -> TorchSteps:
         if self.config.backend == "fused" and self.config.device == "cpu":

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from safemr.learning import losses
+from safemr.learning.adam import Adam
 from safemr.learning.networks import StackedMLP, squashed_gaussian
 from safemr.learning.replay import Batch
 
@@ -25,7 +26,7 @@ class Stepped(Protocol):
     policy: StackedMLP
     multiplier: StackedMLP
     log_temperature: Tensor
-    optimisers: dict[str, torch.optim.Adam]
+    optimisers: dict[str, Adam]
 
     def noise(self, count: int) -> Tensor: ...
 

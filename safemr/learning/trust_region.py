@@ -58,7 +58,9 @@ def fisher_vector_product(actor: GaussianActor, observations: Tensor, damping: f
     def product(v: Tensor) -> Tensor:
         tangent, log_std_tangent = v.split([network.numel(), log_std.numel()])
         moved = actor.network.jvp(observations, tangent)[0] * weight
-        (pulled,) = torch.autograd.grad(mean, network, moved, retain_graph=True)
+        # Not of `mean` along `moved`, which is the same: for that PyTorch imports sympy.
+        along = (mean * moved).sum()
+        (pulled,) = torch.autograd.grad(along, network, retain_graph=True)
         return torch.cat([pulled, 2.0 * log_std_tangent]).add_(v, alpha=damping)
 
     return product

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 
 from safemr import paper
-from safemr.aircraft.neural import CONTROL
-from safemr.aircraft.scoring import FLIGHTS, as_scores
+from safemr.aircraft.scoring import CONTROL, FLIGHTS, as_scores
 from safemr.conventions import COVERS
 from safemr.report import statistics
 from safemr.report.tables import ABSENT, FEW, Table, describe_missing, plus_minus

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pandas as pd
-from scipy import stats
+from scipy.special import betaincinv
 
 from safemr import paper
 from safemr.report import statistics
@@ -43,7 +43,7 @@ def table(
         steps = statistics.score_interval(flown, task, variant, rule.cost)
         total = episodes * len(ours[rule.clean])
         dirty = round(float((episodes * (1 - ours[rule.clean])).sum()))
-        bound = 1.0 if dirty == total else float(stats.beta.ppf(0.95, dirty + 1, total - dirty))
+        bound = 1.0 if dirty == total else float(betaincinv(dirty + 1, total - dirty, 0.95))
         rows.append(
             {
                 "task": task, "variant": variant, "seeds": mean.size,

@@ -39,30 +39,6 @@ rule table_1:
         "../scripts/tables.py"
 
 
-rule training_curves:
-    input:
-        progress=rules.aggregate.output.progress,
-    output:
-        pdf=f"{FIGURES}/training_curves.pdf",
-        png=report(
-            f"{FIGURES}/training_curves.png",
-            caption="../report/training_curves.rst",
-            category="Figures",
-        ),
-    log:
-        f"{LOGS}/training_curves.log",
-    threads: 1
-    params:
-        **GRID,
-        **BUDGET,
-        sources=sources("training_curves"),
-    script:
-        "../scripts/training_curves.py"
-
-
-TARGETS += [*rules.table_1.output, *rules.training_curves.output]
-
-
 def figure_outputs(*names):
     """PDFs, and PNGs that the report shows, each with the caption of its name."""
     captions = {name: f"../report/{name.partition('/')[0]}.rst" for name in names}
@@ -94,22 +70,28 @@ rule illustrations:
         "../scripts/illustrations.py"
 
 
-# Learning for the money: the same returns against processor time.
-rule compute_curves:
+# What reads all of the progress, in one process: training, the same against processor time, and the
+# learned parameters.
+CURVES = ["training_curves", "compute_curves"] + ["parameters"] * bool(LEARNED)
+
+
+rule curves:
     input:
         progress=rules.aggregate.output.progress,
         runs=rules.aggregate.output.runs,
     output:
-        **figure_outputs("compute_curves"),
+        **figure_outputs(*CURVES),
     log:
-        f"{LOGS}/compute_curves.log",
+        f"{LOGS}/curves.log",
     threads: 1
     params:
         **GRID,
         **BUDGET,
-        sources=sources("compute_curves"),
+        learned=LEARNED,
+        parameters=parameters_of(run for run in PLAN.navigation if run.variant in LEARNED),
+        sources=sources("curves"),
     script:
-        "../scripts/compute_curves.py"
+        "../scripts/curves.py"
 
 
 rule final_scores:
@@ -129,24 +111,6 @@ rule final_scores:
         sources=sources("final_scores"),
     script:
         "../scripts/final_scores.py"
-
-
-rule parameters:
-    input:
-        progress=rules.aggregate.output.progress,
-    output:
-        **figure_outputs("parameters"),
-    log:
-        f"{LOGS}/parameters.log",
-    threads: 1
-    params:
-        **BUDGET,
-        tasks=GRID["tasks"],
-        learned=LEARNED,
-        parameters=parameters_of(run for run in PLAN.navigation if run.variant in LEARNED),
-        sources=sources("parameters"),
-    script:
-        "../scripts/parameters.py"
 
 
 # Made on demand (docs/tuning.md): the learned parameters against what moved them.
@@ -228,10 +192,8 @@ rule policies:
         "../scripts/policies.py"
 
 
-TARGETS += [*rules.compute_curves.output, *rules.final_scores.output]
+TARGETS += [*rules.table_1.output, *rules.curves.output, *rules.final_scores.output]
 if ILLUSTRATIONS:
     TARGETS += [*rules.illustrations.output]
-if LEARNED:
-    TARGETS += [*rules.parameters.output]
 if LEARNED and ROBOT_TASKS:
     TARGETS += [*rules.policies.output]

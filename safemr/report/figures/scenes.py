@@ -75,10 +75,10 @@ def animation(
     recording it is one frame that says so, and a shorter recording ends earlier.
     """
     steps = min([steps, *(len(data["robot"]) - 1 for data in recorded.values())])
-    frames = [
-        _frame_image(recorded, draw_scene, episode, step, pixels)
-        for step in range(0, steps + 1, stride)
-    ] if recorded else [_pixels(_nothing())]  # fmt: skip
+    shown = range(0, steps + 1, stride)
+    frames = (
+        _frames(recorded, draw_scene, episode, shown, pixels) if recorded else [_pixels(_nothing())]
+    )
     width, height = frames[0].size
     sample = Image.new("RGB", (width, 3 * height))
     for place, frame in enumerate((frames[0], frames[len(frames) // 2], frames[-1])):
@@ -92,22 +92,33 @@ def animation(
 
 
 @style.styled
-def _frame_image(
-    recorded: Mapping[str, Arrays], draw_scene: DrawScene, episode: int, step: int, pixels: int
-) -> Image.Image:
+def _frames(
+    recorded: Mapping[str, Arrays],
+    draw_scene: DrawScene,
+    episode: int,
+    steps: Sequence[int],
+    pixels: int,
+) -> list[Image.Image]:
+    """A picture a step, on one figure: new axes and their layout cost more than the drawing."""
     dpi = 100
     figure = style.new_figure(len(recorded) * pixels / dpi, 1.1 * pixels / dpi)
+    figure.set_dpi(dpi)
     axes = figure.subplots(1, len(recorded), squeeze=False)[0]
     view = _view(list(recorded.values()), episode)
-    for ax, (variant, data) in zip(axes, recorded.items(), strict=True):
-        draw_scene(ax, scene_at(data, episode, step))
-        start = max(0, step - 75)
-        ax.plot(*data["robot"][start : step + 1, episode, :2].T, color=style.colour(variant), lw=1)
-        goals = int(data["goal_met"][:step, episode].sum())
-        _frame(ax, f"{style.label(variant)}: goals {goals}")
-        ax.set(xlim=view[0], ylim=view[1])
-    figure.set_dpi(dpi)
-    return _pixels(figure)
+    frames = []
+    for step in steps:
+        for ax, (variant, data) in zip(axes, recorded.items(), strict=True):
+            for artist in (*ax.patches, *ax.lines):
+                artist.remove()
+            draw_scene(ax, scene_at(data, episode, step))
+            path = data["robot"][max(0, step - 75) : step + 1, episode, :2]
+            ax.plot(*path.T, color=style.colour(variant), lw=1)
+            goals = int(data["goal_met"][:step, episode].sum())
+            _frame(ax, f"{style.label(variant)}: goals {goals}")
+            ax.set(xlim=view[0], ylim=view[1])
+        frames.append(_pixels(figure))
+        figure.set_layout_engine("none")  # what the first frame found fits the others
+    return frames
 
 
 def _pixels(figure: Figure) -> Image.Image:
