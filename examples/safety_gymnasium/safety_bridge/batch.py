@@ -7,6 +7,7 @@ its simulator is installed: `PINNED` is what its numbers depend on.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -51,8 +52,8 @@ class SafetyBatch(gymnasium.vector.VectorEnv):
         if not python:
             raise UserError(f"{name}: {PYTHON} is not set; name the simulator's Python: {REMEDY}")
         self._python, self._errors = python, tempfile.TemporaryFile()  # noqa: SIM115
-        # -I: nothing of this Python's paths; -O: no assertions, which are a third of the simulator's
-        # time (that observations are finite is seen to here).
+        # -I: none of this Python's paths. -O: no assertions, that of an observation in its space
+        # above all, which takes a good part of the simulator's time; `safemr` looks at each itself.
         command = [python, "-I", "-O", str(Path(server.__file__).resolve()), name]
         try:
             # A session of its own: Ctrl-C is for this program, which may still want to step.
@@ -121,10 +122,8 @@ class SafetyBatch(gymnasium.vector.VectorEnv):
 
     def _ask(self, kind: bytes, content: NDArray[Any]) -> bytes:
         assert self._child.stdin is not None
-        try:
+        with contextlib.suppress(OSError):  # it has ended; its last message says why
             server.send(self._child.stdin, kind, content.tobytes())
-        except OSError:  # it has ended; its last message says why
-            pass
         return self._answer(server.VIEW)
 
     def _answer(self, wanted: bytes) -> bytes:
@@ -152,10 +151,8 @@ class SafetyBatch(gymnasium.vector.VectorEnv):
         """End the server, which it does when it is told nothing more."""
         for stream in (self._child.stdin, self._child.stdout, self._errors):
             assert stream is not None
-            try:
+            with contextlib.suppress(OSError):  # what was written to a server that had ended
                 stream.close()
-            except OSError:  # what was last written to a server that had ended
-                pass
         try:
             self._child.wait(timeout=10.0)
         except subprocess.TimeoutExpired:

@@ -1,8 +1,8 @@
 """The simulator's side: steps Safety-Gymnasium's worlds for a program in another Python.
 
-Started by `safety_bridge.batch` as ``python -I -O server.py NAME WORLDS LIMIT``, with the Python that
-has Safety-Gymnasium (3.8 or later); it needs nothing of the other one's packages. A message is a
-letter, the number of bytes that follow, and these, on standard input and output:
+Started by `safety_bridge.batch` as ``python -I -O server.py NAME WORLDS LIMIT``, with the Python
+that has Safety-Gymnasium (3.8 or later); it needs nothing of the other one's packages. A message is
+a letter, the number of bytes that follow, and these, on standard input and output:
 
     HELLO ->  JSON: versions, bounds of the spaces, d_min [m], obstacles M, steps of an episode
     <- RESET  int64 [N], a seed for each world, or `CONTINUE` or `LEAVE`
@@ -66,8 +66,7 @@ def simulator() -> Any:
     def dataclass(cls: Any = None, **options: Any) -> Any:
         if cls is None:
             return lambda cls: dataclass(cls, **options)
-        for name in cls.__dict__.get("__annotations__", {}):
-            value = cls.__dict__.get(name)
+        for name, value in list(vars(cls).items()):
             if isinstance(value, np.ndarray):
                 setattr(cls, name, dataclasses.field(default_factory=value.copy))
         return plain(cls, **options)
@@ -123,10 +122,11 @@ def reach(agent: Any) -> float:
 class Worlds:
     """N worlds of one task, each with its M hazards and pillars that cost something.
 
-    d is the distance of the robot's origin from an obstacle's axis, d_dot its rate, -v.e for the
-    robot's velocity v and the direction e to the obstacle, which does not move. A hazard costs where
-    d is less than its radius, which is d_min; a pillar where the robot touches it, which is nowhere
-    beyond its radius and the robot's reach: its d is shifted so that this is at d_min, too.
+    d is the distance of the robot's origin from an obstacle's axis in the plane, d_dot its rate:
+    -v.e for the robot's velocity v and the direction e to the obstacle, which does not move. A
+    hazard costs where d is less than its radius, which is d_min; a pillar where the robot touches
+    it, which is nowhere beyond its radius and the robot's reach: its d is shifted so that this is
+    at d_min, too.
     """
 
     def __init__(self, package: Any, name: str, count: int, limit: int) -> None:
