@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from safemr.environments import OPTIONAL_INFOS, SafetyEnvs
 from safemr.errors import UserError, show
-from safemr.foreign_check import Found, examined, first_line
+from safemr.foreign_check import Found, examined, failure, first_line
 
 Floats = NDArray[np.floating]
 Flags = NDArray[np.bool_]
@@ -176,7 +176,7 @@ class ForeignEnvs:
         rows = np.ones(self.num_envs, np.bool_) if mask is None else mask
         if isinstance(seed, int):
             self._seed = seed
-        result = self.envs.reset(seed=seed, options=dict(options) if options else None)
+        result = self._called("reset", seed=seed, options=dict(options) if options else None)
         observations = self._read(result[0])
         if not np.array_equal(observations[~rows], self._observations[~rows]):
             raise UserError(
@@ -193,7 +193,7 @@ class ForeignEnvs:
         given = given.reshape(self.num_envs, *self._low.shape)
         given = self._low + 0.5 * (given + 1.0) * (self._high - self._low)
         given = given.astype(self._action.dtype).clip(self._action.low, self._action.high)
-        observations, rewards, terminated, truncated, infos = self.envs.step(given)
+        observations, rewards, terminated, truncated, infos = self._called("step", given)
         self._steps += 1
         everywhere = np.ones(self.num_envs, np.bool_)
         rewards = self._finite(np.asarray(rewards, float), "a reward", everywhere)
@@ -216,6 +216,18 @@ class ForeignEnvs:
         self._place(infos, everywhere)
         result |= {"d": self._d, "d_dot": self._d_dot}
         return self._observations, rewards, np.asarray(terminated), np.asarray(truncated), result
+
+    def _called(self, name: str, *arguments: Any, **keywords: Any) -> Any:
+        """What the environments' `reset` or `step` gives."""
+        try:
+            return getattr(self.envs, name)(*arguments, **keywords)
+        except UserError:
+            raise
+        except Exception as error:  # the environment's own, whatever its type
+            raise UserError(
+                f"{self._label}: {name} fails after {self._steps} steps of {self.num_envs} "
+                f"environments: {failure(error)}"
+            ) from error
 
     def _sums(
         self, infos: Mapping[str, Any], final: Mapping[str, Any], name: str, done: Flags

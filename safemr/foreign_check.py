@@ -9,8 +9,10 @@ from __future__ import annotations
 import functools
 import importlib
 import json
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -22,6 +24,14 @@ from safemr.environments import bounded
 from safemr.errors import UserError, show
 
 PLAYED = 50  # steps of random actions, in which what is missing is noticed
+# Whose lines are not where an environment's fault is.
+CALLERS = tuple(
+    str(Path(path).resolve().parent) for path in (__file__, gymnasium.__file__, np.__file__)
+)
+INTERFACE = (
+    "Gymnasium calls reset(seed=, options=) for (observation, info) and step(action) for "
+    "(observation, reward, terminated, truncated, info)"
+)
 
 
 @dataclass
@@ -59,6 +69,14 @@ def first_line(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
+def failure(error: BaseException) -> str:
+    """An exception of an environment in one line, with the place in its source where it has one."""
+    lines = traceback.extract_tb(error.__traceback__)
+    own = [line for line in lines if not line.filename.startswith(CALLERS)]
+    place = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+    return first_line(error) + place
+
+
 def spec_of(identity: str, label: str) -> EnvSpec:
     """The registration of an id, whose module is imported.
 
@@ -94,6 +112,9 @@ def _examined(name: str, asked: str) -> Found:
     world = _made(task, spec, found, label)
     found.version = _version(spec, world)
     try:
+        for space in ("action_space", "observation_space"):
+            if not isinstance(_attribute(world, space), gymnasium.Space):
+                raise UserError(f"{label}: it has no {space}; make it one of gymnasium.spaces")
         _spaces(world, found)
         _limit(world, task, found)
         _play(world, task, found, label)
@@ -258,9 +279,14 @@ def _play(world: Any, task: Mapping[str, Any], found: Found, label: str) -> None
                 break
             if terminated or truncated:
                 told["reset"].append(world.reset()[1])
+    except UserError:
+        raise
     except Exception as error:
         where = f"step {played}" if played else "its reset"
-        raise UserError(f"{label}: {where} fails: {first_line(error)}") from error
+        reason = failure(error)
+        if reason == first_line(error):  # none of its lines: it is not called as it should be
+            reason += f"; {INTERFACE}"
+        raise UserError(f"{label}: {where} fails: {reason}") from error
     lacking = [info for info in told["step"] if "cost" not in info]
     if lacking:
         found.problems.append(

@@ -43,6 +43,10 @@ class Line(gymnasium.Env):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.steps += 1
+        if self.fault == "raises" and self.steps > 2:
+            raise RuntimeError("no bolt")
+        if self.fault == "short":
+            return self._seen(), 0.0, False, {}  # type: ignore[return-value]
         self.speed = 0.5 * (float(np.ravel(action)[0]) - 2.0)
         self.x += 0.1 * self.speed
         told = self._told()
@@ -88,7 +92,12 @@ class Free(Line):
         return self._seen(), self.x, False, False, {"cost": float(self.x > 1.0)}
 
 
+class Spaceless(gymnasium.Env):
+    """Says neither what it shows nor what it takes."""
+
+
 gymnasium.register(id="Line-v2", entry_point=Line, max_episode_steps=EPISODE)
 gymnasium.register(id="Endless-v0", entry_point=Line)
 gymnasium.register(id="Free-v0", entry_point=Free, max_episode_steps=EPISODE)
+gymnasium.register(id="Spaceless-v0", entry_point=Spaceless, max_episode_steps=EPISODE)
 gymnasium.register(id="Batched-v0", vector_entry_point=ToyEnvs, max_episode_steps=40)

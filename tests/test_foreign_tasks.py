@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import safemr
-from safemr import cli
+from safemr import cli, foreign_check
 from safemr.certificates import energy
 from safemr.environments import check_envs
 from safemr.errors import UserError
@@ -140,6 +140,8 @@ def test_a_batch_that_restarts_all_worlds_for_one_is_refused() -> None:
         ({"d_min": None}, "d_min"),
         ({"d_min": -1.0}, "d_min is -1.0"),
         ({"colour": "red"}, "colour"),
+        ({"fault": "raises"}, "step 3 fails: RuntimeError: no bolt (foreign_worlds.py, line "),
+        ({"fault": "short"}, "step(action) for (observation, reward, terminated,"),
     ],
 )
 def test_a_fault_is_one_line_with_a_remedy(settings: dict[str, Any], named: str) -> None:
@@ -172,6 +174,24 @@ def test_what_goes_wrong_later_is_one_line_too(fault: str, named: str) -> None:
     assert named in str(caught.value)
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Gymnasium prints what its workers raise
+@pytest.mark.parametrize("vectorization", ["sync", "async"])
+def test_an_exception_of_its_own_is_one_line(
+    vectorization: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where `check` did not meet it, as it plays little."""
+    monkeypatch.setattr("safemr.foreign_check.PLAYED", 2)
+    foreign_check._examined.cache_clear()
+    envs = make_envs({**line(fault="raises"), "vectorization": vectorization}, 2)
+    envs.reset(seed=0)
+    for _ in range(2):
+        envs.step(np.zeros((2, 1)))
+    words = r"^task Line: step fails after 2 steps of 2 environments: RuntimeError: no bolt"
+    with pytest.raises(UserError, match=words):
+        envs.step(np.zeros((2, 1)))
+    foreign_check._examined.cache_clear()
+
+
 @pytest.mark.parametrize(
     ("identity", "named"),
     [
@@ -179,6 +199,7 @@ def test_what_goes_wrong_later_is_one_line_too(fault: str, named: str) -> None:
         (f"{MODULE}:Lines-v2", "registers no Lines-v2"),
         ("Nowhere-v0", "Gymnasium knows no Nowhere-v0"),
         (f"{MODULE}:Endless-v0", "no limit"),
+        (f"{MODULE}:Spaceless-v0", "it has no action_space; make it one of gymnasium.spaces"),
     ],
 )
 def test_check_says_what_is_missing(
@@ -200,6 +221,8 @@ def test_check_is_content_with_what_can_be_trained(capsys: pytest.CaptureFixture
     assert "9 steps at most" in said
     assert "2: 1 scaled by their bounds, 1 by running statistics" in said
     assert f"safemr train --task {identity} --set task.max_episode_steps=9" in said
+    assert cli.main(["check", f"{MODULE}:Free-v0"]) == 0  # no distances: no energy function
+    assert capsys.readouterr().out.splitlines()[-1].endswith("--algorithm sac_lagrangian")
     # d_min may come from the configuration, and must not contradict the environment.
     given = ["--set", "task.d_min=0.3"]
     assert cli.main(["check", identity, *given]) == 2

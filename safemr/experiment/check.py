@@ -17,8 +17,8 @@ from safemr.experiment.task_entries import ForeignTask
 from safemr.tasks import make_envs
 
 
-def lines(identity: str, settings: Mapping[str, Any]) -> tuple[list[str], bool]:
-    """What to say of an environment, and whether it can be trained on.
+def lines(identity: str, settings: Mapping[str, Any]) -> tuple[list[str], str]:
+    """What to say of an environment, and an algorithm to begin with, none where it is not ready.
 
     Raises:
         UserError: it cannot be made or played at all.
@@ -38,7 +38,8 @@ def lines(identity: str, settings: Mapping[str, Any]) -> tuple[list[str], bool]:
             check_envs(envs)
         finally:
             envs.close()
-    return said, not found.problems
+    fitting = "sac_lagrangian" if found.lacks else "safemr"
+    return said, "" if found.problems else fitting
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,12 +65,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not name.startswith("task."):
             raise UserError(f"--set {name}: an environment has task.NAME only")
     given = {name.removeprefix("task."): value for name, value in settings.items()}
-    said, ready = lines(options.id, given)
+    said, algorithm = lines(options.id, given)
     flags = "".join(f" --set {text}" for text in options.set)
     verdict = (
-        f"ready: safemr train --task {options.id}{flags} --algorithm safemr"
-        if ready
+        f"ready: safemr train --task {options.id}{flags} --algorithm {algorithm}"
+        if algorithm
         else "not ready: see what is missing"
     )
     tell("\n".join([options.id, *said, verdict]), sys.stdout)
-    return 0 if ready else 2
+    return 0 if algorithm else 2

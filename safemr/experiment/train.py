@@ -73,7 +73,7 @@ def train(
     session: RunSession,
     *,
     label: str = "",
-    stream: TextIO = sys.stderr,
+    stream: TextIO | None = None,
     wandb: Mapping[str, str] | None = None,
 ) -> None:
     """Trains inside an open ``session``, continuing from its checkpoint where there is one.
@@ -113,7 +113,7 @@ def train(
         trainer.load_state_dict(state)
         tell(f"{label} continues at step {trainer.step}", stream)
     family = families.named(described["hyperparameters"].get("family", families.PAPER.name))
-    progress = Progress(label, steps, stream, family.names)
+    progress = Progress(label, steps, stream or sys.stderr, family.names)
     with WandbLog(config, session, wandb or {}) as wandb_log:
         while trainer.step < steps:
             begun, before = time.perf_counter(), trainer.step

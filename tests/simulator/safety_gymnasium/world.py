@@ -1,0 +1,3 @@
+"""The module that reads the assets."""
+
+import yaml  # noqa: F401
