@@ -22,6 +22,33 @@ include: "workflow/rules/sensitivity.smk"
 include: "workflow/rules/aircraft.smk"
 
 
+# On a cluster only what trains is a job of the scheduler: the rest takes seconds to minutes.
+localrules:
+    aggregate,
+    aircraft_comparison,
+    aircraft_figures,
+    aircraft_frontier,
+    aircraft_neural,
+    all,
+    certificate_paths,
+    certificates,
+    claims,
+    compute_curves,
+    controllers,
+    filters,
+    final_scores,
+    illustrations,
+    parameters,
+    policies,
+    rollouts,
+    sensitivity,
+    table_1,
+    training_curves,
+    unseen_layouts,
+    unseen_table,
+    weight_map,
+
+
 onerror:
     print(f"What is complete, and why the rest is not, says: safemr records {RESULTS}")
     print(
