@@ -226,9 +226,10 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
     def failure(self) -> str | None:
         """Why the last attempt said that training cannot go on; None where it did not."""
         try:
-            return read_attempts(self.work)[-1].get("reason")
+            reason: str | None = read_attempts(self.work)[-1].get("reason")
         except (FileNotFoundError, IndexError):
             return None
+        return reason
 
     def elapsed(self) -> dict[str, float]:
         """Wall and CPU seconds of the run, without what was lost between checkpoint and kill."""
