@@ -27,10 +27,38 @@ onstart:
     # While jobs wait for a core Snakemake looks at all of them and their inputs every second, once
     # more for each job that has finished, to hold a limit of 100 starts a second that is of no use
     # here; and it solves a linear program to choose among jobs of one core each.
-    # These are internals: where a later version has none of that name, it goes on as it would.
-    workflow.scheduler.job_rate_limiter = None
-    if hasattr(workflow.scheduler, "job_selector_greedy"):
-        workflow.scheduler._job_selector = workflow.scheduler.job_selector_greedy
+    # These are internals: where a later version has none of that name, it goes on as it would. A
+    # cluster's limit is its administrator's business and stays.
+    if getattr(workflow, "local_exec", False):
+        workflow.scheduler.job_rate_limiter = None
+        if hasattr(workflow.scheduler, "job_selector_greedy"):
+            workflow.scheduler._job_selector = workflow.scheduler.job_selector_greedy
+
+
+# On a cluster only what trains is a job of the scheduler: the rest takes seconds to minutes.
+localrules:
+    aggregate,
+    aircraft_comparison,
+    aircraft_figures,
+    aircraft_frontier,
+    aircraft_neural,
+    all,
+    certificate_paths,
+    certificates,
+    claims,
+    controllers,
+    curves,
+    filters,
+    final_scores,
+    illustrations,
+    policies,
+    rollouts,
+    sensitivity,
+    sizes,
+    table_1,
+    unseen_layouts,
+    unseen_table,
+    weight_map,
 
 
 onerror:

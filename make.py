@@ -1,9 +1,10 @@
 """Set up an environment and run this repository in it; needs nothing but Python 3.11 or later.
 
-    python3 make.py all [ARGUMENTS]    snakemake -j2 --keep-going all ARGUMENTS
-    python3 make.py test [ARGUMENTS]   the fast tests: pytest -n 2 -m "not slow" ARGUMENTS
-    python3 make.py run -- COMMAND     any command inside the environment
-    python3 make.py lock               renew requirements.lock from pyproject.toml
+    python3 make.py all [ARGUMENTS]      snakemake -j2 --keep-going all ARGUMENTS
+    python3 make.py cluster [ARGUMENTS]  the same through Slurm, by workflow/profiles/slurm
+    python3 make.py test [ARGUMENTS]     the fast tests: pytest -n 2 -m "not slow" ARGUMENTS
+    python3 make.py run -- COMMAND       any command inside the environment
+    python3 make.py lock                 renew requirements.lock from pyproject.toml
 
 The environment is .venv, or the folder that SAFEMR_VENV names; where the path of this repository
 holds spaces or quotes, a folder in the user's cache (~/.cache/safemr). It is built on first use
@@ -43,13 +44,14 @@ def main(arguments: Sequence[str]) -> int:
     command, rest = (arguments[0], list(arguments[1:])) if arguments else ("", [])
     if command == "lock" and not rest:
         return write_lock()
-    if command == "all":
+    if command in ("all", "cluster"):
+        here = ["-j2", "--keep-going"]
+        how = here if command == "all" else ["--profile", "workflow/profiles/slurm"]
         # Of a dry run: what is trained and how many jobs there are. Snakemake's reasons name every
         # file of every record in one line; `snakemake -n all` prints them.
         quiet = ["--quiet", "rules", "host"] if any(map(is_dry, rest)) else []
-        return check(rest) or run(
-            "python", "-P", "-m", "snakemake", "-j2", *quiet, "--keep-going", "all", *rest
-        )
+        snakemake = ("python", "-P", "-m", "snakemake", *how, *quiet, "all", *rest)
+        return check(rest) or (command == "cluster" and add("cluster")) or run(*snakemake)
     if command == "test":
         return run("python", "-m", "pytest", "-n", "2", "-m", "not slow", *rest)
     if command == "run" and rest and rest != ["--"]:
@@ -78,6 +80,24 @@ def run(*command: str) -> int:
             return subprocess.run([program, *command[1:]], cwd=ROOT, env=variables).returncode
         except KeyboardInterrupt:
             return 130
+
+
+def add(extra: str) -> int:
+    """Install an extra of pyproject.toml whose versions are pinned, unless it is there already."""
+    folder = environment()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pins = project["optional-dependencies"][extra]
+    if not all(is_installed(folder, pin) for pin in pins):
+        print(f"Adding {', '.join(pins)} to {folder}", flush=True)
+        with exclusive(folder.with_name(folder.name + ".lock")):
+            pip(folder, "install", "--quiet", "-c", LOCK.name, *pins)
+    return 0
+
+
+def is_installed(folder: Path, pin: str) -> bool:
+    """Whether an environment holds a package in the version that ``name==version`` asks for."""
+    name = pin.replace("-", "_").replace("==", "-")
+    return any(folder.glob(f"lib/*/site-packages/{name}.dist-info"))
 
 
 def is_dry(argument: str) -> bool:

@@ -7,6 +7,7 @@ import json
 import os
 import pickle
 import signal
+import socket
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from sample_record import CONFIG, POLICY, ROWS
 
 from safemr import files
 from safemr.errors import UserError
-from safemr.experiment import checkpoints, records
+from safemr.experiment import checkpoints, provenance, records
 from safemr.experiment.checkpoints import RunSession
 from safemr.experiment.train import Progress
 
@@ -193,6 +194,39 @@ def test_a_finished_run_leaves_only_its_record(tmp_path: Path) -> None:
     assert provenance["peak_rss_mb"] > 10
     with RunSession(CONFIG, "FAC-phih", tmp_path) as again:
         assert again.complete
+
+
+@pytest.mark.parametrize("variable", ["SLURM_JOB_ID", "PBS_JOBID", "LSB_JOBID"])
+def test_each_attempt_says_where_it_ran(
+    variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The processor always; host and job only of a scheduler's job, since records are published."""
+    for name in ("SLURM_JOB_ID", "PBS_JOBID", "LSB_JOBID"):
+        monkeypatch.delenv(name, raising=False)
+    for number in (None, "71", "72"):
+        if number:
+            monkeypatch.setenv(variable, number)
+        with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+            session.resume()
+    here, *jobs = checkpoints.read_attempts(session.work)
+    assert here["cpu"] == provenance.cpu_model()
+    assert not {"host", "job"} & here.keys()
+    assert [(job["job"], job["host"]) for job in jobs] == [
+        (number, socket.gethostname()) for number in ("71", "72")
+    ]
+
+
+def test_a_failure_is_told_until_the_next_attempt(tmp_path: Path) -> None:
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        assert session.failure() is None
+        session.resume()
+        assert session.failure() is None
+        session.fail("the loss is nan")
+        assert session.failure() == "the loss is nan"
+    with RunSession(CONFIG, "FAC-phih", tmp_path) as session:
+        assert session.failure() == "the loss is nan"
+        session.resume()
+        assert session.failure() is None
 
 
 def test_an_orphan_stops_with_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -333,3 +333,39 @@ def test_the_lock_holds_what_the_pipeline_and_the_tests_need_extras_included(
     for package in ("numpy", "snakemake", "pytest", "wandb", "setuptools"):
         assert any(need.startswith(f"{package}>=") for need in asked), package
     assert make.LOCK.read_text() == make.HEADER + "numpy==2.0.0\n"
+
+
+def test_the_cluster_is_asked_through_the_profile_and_its_pinned_plugins(
+    make: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is missing is installed within the locked versions, once; `all` installs nothing."""
+    installed: list[tuple[str, ...]] = []
+    ran: list[tuple[str, ...]] = []
+
+    def pip(folder: Path, *arguments: str) -> str:
+        installed.append(arguments)
+        for name, _, version in (pin.partition("==") for pin in arguments if "==" in pin):
+            stem = name.replace("-", "_")
+            (tmp_path / f"lib/python3/site-packages/{stem}-{version}.dist-info").mkdir(parents=True)
+        return ""
+
+    monkeypatch.setattr(make, "environment", lambda: tmp_path)
+    monkeypatch.setattr(make, "pip", pip)
+    monkeypatch.setattr(make, "run", lambda *command: ran.append(command) or 0)
+    for command in ("all", "cluster", "cluster"):
+        assert make.main([command, "--default-resources", "slurm_account=me"]) == 0
+    ((*options, slurm, jobstep, generic),) = installed
+    assert options == ["install", "--quiet", "-c", "requirements.lock"]
+    assert [pin.partition("==")[0].rpartition("-")[2] for pin in (slurm, jobstep, generic)] == [
+        "slurm",
+        "jobstep",
+        "generic",
+    ]
+    local, *clusters = ran
+    assert "-j2" in local
+    assert "--profile" not in local
+    for command in clusters:
+        profile = command[command.index("--profile") + 1]
+        assert (ROOT / profile / "config.yaml").is_file()
+        assert command[-3:] == ("all", "--default-resources", "slurm_account=me")
+        assert "-j2" not in command

@@ -180,6 +180,7 @@ def rule_line(run: planning.Run, root: Path, log: Path) -> str:
         ),
         CONFIG=SimpleNamespace(wandb_mode=Quoted("disabled"), wandb_project=Quoted("none")),
         log=Quoted(log),
+        resources=SimpleNamespace(attempt=1),
     )
     return f"set -euo pipefail; {filled}"
 

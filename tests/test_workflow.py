@@ -269,6 +269,19 @@ def test_every_rule_states_log_and_threads() -> None:
             assert re.search(r"(?m)^    threads: ", rule), f"{path.name}: {name} has no threads"
 
 
+def test_on_a_cluster_training_alone_is_a_job() -> None:
+    """What makes records asks for memory and time, and is tried again when the user says so."""
+    text = "".join(path.read_text() for path in sorted((ROOT / "workflow/rules").glob("*.smk")))
+    rules = {rule.partition(":")[0][5:]: rule for rule in re.split(r"(?m)^(?=rule )", text)[1:]}
+    jobs = {name for name, rule in rules.items() if "{RECORD}/" in rule}
+    listed = (ROOT / "Snakefile").read_text().partition("localrules:\n")[2].partition("\n\n")[0]
+    assert set(re.findall(r"\w+", listed)) == rules.keys() - jobs | {"all"}
+    assert jobs == {"train", "cross_entropy"}
+    for name in jobs:
+        assert re.search(r"(?m)^    resources:\n        \*\*TRAINING,$", rules[name]), name
+    assert "retries:" not in text
+
+
 def marker(checkout: Checkout, output: str) -> Path:
     """Snakemake's mark that an output was being written."""
     folder = checkout.folder / ".snakemake/incomplete"
@@ -430,11 +443,13 @@ def test_roots_outside_the_repository(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_diverging_run_stops_alone(checkout: Checkout) -> None:
-    """The rest of the grid goes on, the failure is not tried again, and the summary names it."""
+    """The rest of the grid goes on, the failure is not tried again, not with --retries either,
+    until a new Snakemake is started; and the summary names it."""
     diverging = {"algorithm": "safemr", "target_entropy": 1.386, "temperature_lr": 1.0}
     diverging["start_steps"] = 200
     checkout.configure(seeds=[100], algorithms={"Lost": diverging, **GRID["algorithms"]})
-    printed = checkout.snakemake("all", "--keep-going", check=False)
+    printed = checkout.snakemake("all", "--keep-going", "--retries", "2", check=False)
+    assert printed.count("error: Lost Pillars-0.15-Goal seed 100 diverged before") == 2
     recorded = {run.variant for run in checkout.plan().runs
                 if records.is_complete(checkout.folder / "results" / run.path)}  # fmt: skip
     assert recorded == set(GRID["algorithms"])

@@ -214,13 +214,22 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
                 tell(f"warning: starting again from step 0: {error}")
         self._saved = self._step()
         started = {"started": provenance.now(), "step": self._saved}
-        self._note({**started, **provenance.source_revision(), **self._outside})
+        where = {**provenance.source_revision(), **provenance.place()}
+        self._note({**started, **where, **self._outside})
         self._signals.defer()
         return content["state"] if content else None
 
     def fail(self, reason: str) -> None:
         """Keep why training cannot go on, for `safemr records` to tell."""
         self._note({"failed": provenance.now(), "reason": reason})
+
+    def failure(self) -> str | None:
+        """Why the last attempt said that training cannot go on; None where it did not."""
+        try:
+            reason: str | None = read_attempts(self.work)[-1].get("reason")
+        except (FileNotFoundError, IndexError):
+            return None
+        return reason
 
     def elapsed(self) -> dict[str, float]:
         """Wall and CPU seconds of the run, without what was lost between checkpoint and kill."""

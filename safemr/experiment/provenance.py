@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import datetime
+import os
 import platform
 import resource
+import socket
 import subprocess
 import sys
 from importlib import metadata
@@ -13,6 +15,8 @@ from typing import Any
 
 from safemr.files import REPOSITORY
 
+# Where schedulers put the number of a job: Slurm, PBS, LSF.
+JOBS = ("SLURM_JOB_ID", "PBS_JOBID", "LSB_JOBID")
 PACKAGES = ("gymnasium", "mujoco", "numba", "numpy", "scipy", "torch")
 
 
@@ -73,6 +77,16 @@ def cpu_model() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
+
+
+def place() -> dict[str, str]:
+    """Where this process runs: the processor, and in a scheduler's job its number and host.
+
+    Processors differ in the last bits, and a host may be faulty. A person's own machine has a name
+    that says nothing of a result, and records are published: it is not written down.
+    """
+    job = next((os.environ[name] for name in JOBS if os.environ.get(name)), None)
+    return {"cpu": cpu_model(), **({"host": socket.gethostname(), "job": job} if job else {})}
 
 
 def peak_rss_mb() -> float:

@@ -185,6 +185,12 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--die-with-parent", action="store_true", help="stop when the parent process is gone"
     )
+    parser.add_argument(
+        "--attempt",
+        type=int,
+        default=1,
+        help="which try of one Snakemake this is: from the second on a run that diverged is left",
+    )
     return parser.parse_args(argv)
 
 
@@ -299,6 +305,9 @@ def _run(arguments: argparse.Namespace, signals: StopSignals) -> int:
         if session.complete:
             tell(f"{label}: already recorded in {session.folder}")
             return 0
+        if arguments.attempt > 1 and (reason := session.failure()):
+            tell(f"error: {label} diverged before and is not tried again: {reason}")
+            return 4
         try:
             train(
                 config,

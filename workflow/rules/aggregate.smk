@@ -6,6 +6,7 @@ RECORDED = [
     for run in PLAN.runs
     if not CONFIG.allow_missing or os.path.exists(f"{RESULTS}/{run.path}/provenance.json")
 ]
+RECORDED_PATHS = {run.path for run in RECORDED}  # looked up for each run by every job of a cluster
 if not RECORDED:
     sys.exit("error: allow_missing is set, but none of the configured runs is recorded yet")
 

@@ -6,8 +6,8 @@ NEURAL_PLAN = [
     run for run in PLAN.aircraft if PLAN.encounter.learns[run.variant] == "network"
 ]
 AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
-AIRCRAFT = [run for run in AIRCRAFT_PLAN if run in RECORDED]
-NEURAL = [run for run in NEURAL_PLAN if run in RECORDED]
+AIRCRAFT = [run for run in AIRCRAFT_PLAN if run.path in RECORDED_PATHS]
+NEURAL = [run for run in NEURAL_PLAN if run.path in RECORDED_PATHS]
 ENCOUNTER = dict(PLAN.aircraft[0].config["task"]) if PLAN.aircraft else paper.AIRCRAFT_TASK
 AIRCRAFT_FIGURES = ["aircraft_slices", "aircraft_airplane", "aircraft_frontier"]
 

@@ -21,6 +21,8 @@ os.environ["PYTHONPATH"] = os.pathsep.join(
     [workflow.basedir, *filter(None, [os.environ.get("PYTHONPATH")])]
 )
 
+from snakemake.exceptions import WorkflowError
+
 from safemr.experiment.config import load
 from safemr.certificates.families import named
 from safemr.errors import UserError

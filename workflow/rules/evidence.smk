@@ -9,7 +9,7 @@ LEARNED = PLAN.grid.learned
 FIRST_RUNS = {}
 for entry in (*PLAN.navigation, *PLAN.sensitivity):
     learns = entry.variant in (*LEARNED, *PLAN.points)
-    if learns and PLAN.tasks[entry.task].traits.point_robot and entry in RECORDED:
+    if learns and PLAN.tasks[entry.task].traits.point_robot and entry.path in RECORDED_PATHS:
         FIRST_RUNS.setdefault((entry.task, entry.variant), entry)
 
 # The paper's certificates are those of one of its tasks, and stand beside what was learned there.

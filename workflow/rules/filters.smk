@@ -3,7 +3,7 @@ FILTERS = CONFIG.filters
 FILTERED = {}  # task -> label -> recorded runs
 for run in PLAN.navigation if FILTERS else ():
     wanted = run.variant in (*FILTERS.policies, *FILTERS.certificates)
-    if wanted and run.config["seed"] in FILTERS.seeds and run in RECORDED:
+    if wanted and run.config["seed"] in FILTERS.seeds and run.path in RECORDED_PATHS:
         if run.task in (ROBOT_TASKS if FILTERS.tasks is None else FILTERS.tasks):
             FILTERED.setdefault(run.task, {}).setdefault(run.variant, []).append(run)
 

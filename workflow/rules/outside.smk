@@ -13,8 +13,10 @@ rule cross_entropy:
         f"{LOGS}/outside/{{task}}_{{variant}}_seed{{seed}}-{{digest}}.log",
     wildcard_constraints:
         variant=one_of(run.path.parts[2] for run in outside_runs("cross_entropy")),
-        digest=one_of(run.digest for run in outside_runs("cross_entropy")),
+        digest=DIGEST,
     threads: 1
+    resources:
+        **TRAINING,
     params:
         resolved=lambda wildcards: run_of(wildcards).resolved,
         variant=lambda wildcards: run_of(wildcards).variant,

@@ -6,8 +6,20 @@
 RECORD = RESULTS + "/runs/{task}/{variant}/seed{seed}-{digest}"
 
 
+# What a run asks of a cluster: peaks of 958 MB for the trainer and 141 for each Snakemake around it
+# were seen; what a time limit ends continues at its checkpoint when it is tried again.
+TRAINING = dict(mem_mb=1500, runtime=lambda wildcards, attempt: 60 * attempt)  # minutes
+
+
+# Not the digests themselves: a pattern of thousands is searched for each file of each run.
+DIGEST = "[0-9a-f]{12}"
+
+
 def run_of(wildcards):
-    return RUNS[RECORD.removeprefix(RESULTS + "/").format(**wildcards)]
+    path = RECORD.removeprefix(RESULTS + "/").format(**wildcards)
+    if path not in RUNS:
+        raise WorkflowError(f"{RESULTS}/{path} is no run of this configuration")
+    return RUNS[path]
 
 
 rule train:
@@ -17,9 +29,11 @@ rule train:
         f"{LOGS}/train/{{task}}_{{variant}}_seed{{seed}}-{{digest}}.log",
     wildcard_constraints:
         variant=one_of(run.path.parts[2] for run in PLAN.trained),
-        digest=one_of(run.digest for run in PLAN.trained),
-    retries: 0  # a run is deterministic: what failed once fails again
+        digest=DIGEST,
     threads: 1
+    resources:
+        **TRAINING,
+        attempt=lambda wildcards, attempt: attempt,  # from --retries; what diverged says no
     params:
         resolved=lambda wildcards: run_of(wildcards).resolved,
         variant=lambda wildcards: run_of(wildcards).variant,
@@ -29,6 +43,7 @@ rule train:
     shell:
         "exec {sys.executable:q} -u -P -m safemr.experiment.train --resolved {params.resolved:q}"
         " --variant {params.variant:q} --root {params.root:q} --die-with-parent --wait"
+        " --attempt {resources.attempt}"
         # The copy to wandb is no part of a run: what is not in `params` does not make it train again.
         " --wandb {CONFIG.wandb_mode:q} --wandb-project {CONFIG.wandb_project:q}"
         " >> {log:q} 2> >(trap '' HUP INT TERM; exec tee -a {log:q} >&2)"

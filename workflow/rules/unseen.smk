@@ -1,7 +1,7 @@
 # The final policies on layouts that no run was evaluated on: ten fixed layouts say little of others.
 FLOWN = {}
 for run in (*PLAN.navigation, *PLAN.sensitivity):
-    if run in RECORDED:
+    if run.path in RECORDED_PATHS:
         FLOWN.setdefault(run.task, {})[run.path.as_posix()] = run
 
 
