@@ -366,8 +366,18 @@ def test_misspelt_names_are_named_with_the_nearest(
     [
         # The value is the default: what is refused is to set it.
         ("sac_lagrangian", "sigma", 0.3, "a hyperparameter of fac, joint_sis, neural_safemr, s"),
-        ("sac_lagrangian", "constraint_floor", -0.001, "a hyperparameter of fac, fac_oracle, joint_sis"),
-        ("cpo", "policy_lr", 3e-4, "a hyperparameter of fac, fac_oracle, joint_sis, neural_safemr, ppo_lagran"),
+        (
+            "sac_lagrangian",
+            "constraint_floor",
+            -0.001,
+            "a hyperparameter of fac, fac_oracle, joint_sis",
+        ),
+        (
+            "cpo",
+            "policy_lr",
+            3e-4,
+            "a hyperparameter of fac, fac_oracle, joint_sis, neural_safemr, ppo_lagran",
+        ),
         ("fac", "certificate_travel", 0.33, "a hyperparameter of joint_sis, safemr"),
         ("joint_sis", "a", 0.35, "a hyperparameter of neural_safemr, safemr"),
     ],

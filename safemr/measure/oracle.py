@@ -12,7 +12,6 @@ from typing import Any
 
 import pandas as pd
 
-from safemr.algorithms import joint_sis
 from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.falsification import make_simulator
 from safemr.certificates.families import PAPER
@@ -67,6 +66,8 @@ class Yardstick:
 
     def oracle(self, measurements: Measurements) -> EnergyCertificate:
         """The least feasible member of the paper's family in JointSIS's box."""
+        from safemr.algorithms import joint_sis  # PyTorch, a second
+
         box = joint_sis.Config().box
         inputs = {**self.inputs, "box": [list(ends) for ends in box], **SEARCH}
 
