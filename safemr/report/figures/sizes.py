@@ -45,7 +45,7 @@ def against_size(
         draw(chosen, "return", upper, oracles[task])
         draw(chosen, "violating", lower, oracles[task])
         lower.set_yscale("symlog", linthresh=0.1)
-        lower.set_ylim(bottom=-0.02)
+        lower.set_ylim(-0.02, max(2.0 * chosen["violating"].max(), 0.2))
         lower.yaxis.set_major_formatter("{x:g}")
         upper.set_title(task)
         lower.set_xlabel("unsafe area (m$^2$)")

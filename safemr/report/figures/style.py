@@ -61,6 +61,9 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
     "FAC-phi0": ("#555555", _DOTTED, "P", r"FAC-$\phi_0$"),
     "FAC-phih": ("#E69F00", _DOTTED, "X", r"FAC-$\phi_h$"),
     "SAC-L": ("#000000", _DASHED, "*", "SAC-L"),
+    # config/oracle.yaml
+    "FAC-oracle": ("#882255", _DOTTED, "p", "FAC-oracle"),
+    "SafeMR-guarded": ("#117733", _SOLID, "h", "SafeMR-guarded"),
     # config/variants.yaml
     "SafeMR-literal": ("#AA3377", _DASH_DOTTED, ">", "SafeMR-literal"),
     "SafeMR-floor-0.02": ("#CCBB44", _DASH_DOTTED, "h", "SafeMR-floor-0.02"),
