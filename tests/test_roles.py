@@ -55,10 +55,10 @@ def test_every_algorithm_has_a_role_and_says_what_it_learns() -> None:
         for algorithm in (planning.load_algorithm(name),)
     }
     assert found == {
-        "safemr": ("method", "zeta", "energy"),
+        **dict.fromkeys(("safemr", "safemr_guarded"), ("method", "zeta", "energy")),
         "joint_sis": ("ablation", "zeta", "energy"),
         "neural_safemr": ("method", "network", "neural"),
-        "fac": ("handcrafted", "nothing", "energy"),
+        **dict.fromkeys(("fac", "fac_oracle"), ("handcrafted", "nothing", "energy")),
         **dict.fromkeys(
             ("cpo", "ppo_lagrangian", "trpo_lagrangian", "sac_lagrangian"),
             ("baseline", "nothing", None),
