@@ -85,11 +85,7 @@ def return_against_cost(
         ax.set_xlabel(cost_name)
     axes[0].set_ylabel("final return")
     variants = style.ordered(wide["variant"].unique())
-    handles = [
-        Line2D([], [], color=style.colour(v), marker=style.marker(v), ls="none", ms=4,
-               label=style.label(v))
-        for v in variants
-    ]  # fmt: skip
+    handles = style.marks(variants)
     columns = style.legend_columns(variants)
     figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     return figure

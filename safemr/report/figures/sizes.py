@@ -52,11 +52,7 @@ def against_size(
     axes[0, 0].set_ylabel("return")
     axes[1, 0].set_ylabel("violating steps an episode")
     variants = style.ordered(points["variant"].unique())
-    handles = [
-        Line2D([], [], color=style.colour(variant), marker=style.marker(variant), ls="none", ms=4,
-               label=style.label(variant))
-        for variant in variants
-    ]  # fmt: skip
+    handles = style.marks(variants)
     handles.append(Line2D([], [], color=style.INK, lw=0.7, ls=(0, (3, 2)), label="oracle"))
     handles.append(
         Line2D([], [], color=style.INK, marker="o", mfc="none", ls="none", ms=4,

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
@@ -111,6 +112,14 @@ def label(variant: str) -> str:
     """The name as printed in a figure (mathtext)."""
     known = _ALGORITHMS.get(variant)
     return known[3] if known else variant
+
+
+def marks(variants: Iterable[str]) -> list[Line2D]:
+    """Entries of a legend for variants that are drawn as markers, in the order given."""
+    return [
+        Line2D([], [], color=colour(v), marker=marker(v), ls="none", ms=4, label=label(v))
+        for v in variants
+    ]
 
 
 def ordered(variants: Iterable[str]) -> list[str]:
