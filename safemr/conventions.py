@@ -28,3 +28,12 @@ def evaluation_seed(seed: int) -> int:
 def unseen_seed(seed: int) -> int:
     """The first of the layouts on which no run with this seed was evaluated while it trained."""
     return UNSEEN_SEED if seed < FIRST_TUNING_SEED else TUNING_UNSEEN_SEED
+
+
+def own_layouts(first: int, episodes: int, seed: int) -> int:
+    """The first of the layouts that runs with this seed alone are flown on, ``episodes`` of them.
+
+    first: that of seed 0. All algorithms with one seed fly the same; no two seeds share any, so
+    that what a layout adds to a return or a violation is part of the spread between seeds.
+    """
+    return first + episodes * seed

@@ -17,7 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE, evaluation_seed, unseen_seed
+from safemr.conventions import (
+    CLEAN_SHARE,
+    COST_TOLERANCE,
+    evaluation_seed,
+    own_layouts,
+    unseen_seed,
+)
 from safemr.errors import UserError, show
 from safemr.experiment.filter_entries import Filters, read_filters
 from safemr.experiment.roles import ROLES
@@ -129,6 +135,7 @@ class UnseenLayouts:
 
     episodes: int
     seed: int
+    own: bool  # each seed's runs on layouts of their own, not all on the same
 
 
 @dataclass(frozen=True)
@@ -145,6 +152,7 @@ class Config:
     evaluation: Evaluation
     interface: Interface  # how learners meet the tasks of `tasks`, where nothing else is said
     unseen_layouts: UnseenLayouts | None
+    protocol: int  # by which verdicts are reached, 1 or 2 (docs/claims.md)
     task_overrides: Mapping[str, TaskOverrides]
     sensitivity: Sensitivity | None
     aircraft: Aircraft | None
@@ -203,6 +211,7 @@ def parse(raw: Any) -> Config:
         ),
         interface=Interface.read(top.get("interface")),
         unseen_layouts=_unseen(top.get("unseen_layouts"), least),
+        protocol=integer(top.get("protocol", 1), "protocol", 1, 2),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
             for name, value in labelled(top.get("task_overrides", {}), "task_overrides")
@@ -227,6 +236,16 @@ def parse(raw: Any) -> Config:
         filters=read_filters(top.get("filters"), top.required("algorithms"), tasks, seeds),
         sizes=flag(top.get("sizes", False), "sizes"),
     )
+    if config.protocol == 2 and not config.unseen_layouts:
+        raise UserError("protocol: 2 judges flights on unseen layouts; say unseen_layouts, too")
+    flights = config.unseen_layouts
+    if flights and flights.own:
+        last = own_layouts(flights.seed, flights.episodes, max(seeds) + 1)
+        if last > LARGEST_SEED:
+            raise UserError(
+                f"unseen_layouts.own: seed {max(seeds)} would fly layouts up to {last}, of at most "
+                f"{LARGEST_SEED}; choose smaller seeds"
+            )
     if config.sizes and not config.unseen_layouts:
         raise UserError("sizes: true draws returns on unseen layouts; say unseen_layouts, too")
     if config.log_points % config.evaluation.points:
@@ -247,6 +266,7 @@ _TOP_LEVEL = (
     *(
         "task_overrides",
         "unseen_layouts",
+        "protocol",
         "sensitivity",
         "aircraft",
         "outside",
@@ -333,10 +353,11 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
 def _unseen(value: Any, least: int) -> UnseenLayouts | None:
     if not value and (value is None or isinstance(value, Mapping)):
         return None
-    section = Section(value, "unseen_layouts", ("episodes", "seed"))
+    section = Section(value, "unseen_layouts", ("episodes", "seed", "own"))
     return UnseenLayouts(
         integer(section.required("episodes"), "unseen_layouts.episodes", 1),
         integer(section.get("seed", unseen_seed(least)), "unseen_layouts.seed", 0, LARGEST_SEED),
+        flag(section.get("own", False), "unseen_layouts.own"),
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from safemr.conventions import own_layouts
 from safemr.experiment.record import Record
 from safemr.measure import evaluate
 from safemr.measure.controllers import SCORE_COLUMNS
@@ -19,12 +20,18 @@ from safemr.tasks import name_of
 
 
 def measured_scores(
-    measurements: Measurements, folders: Sequence[Path], *, episodes: int, seed: int
+    measurements: Measurements,
+    folders: Sequence[Path],
+    *,
+    episodes: int,
+    seed: int,
+    own: bool = False,
 ) -> pd.DataFrame:
     """Score table of records on ``episodes`` layouts, the first with ``seed``; each is kept.
 
-    Metrics are those of the final evaluations (``eval_return``, ...) and ``eval_return_sd``, the
-    standard deviation over layouts. A record without a policy, which is optional, gives no row.
+    own: not all on these, but each on those of its seed (`own_layouts`). Metrics are those of the
+    final evaluations (``eval_return``, ...) and ``eval_return_sd``, the standard deviation over
+    layouts. A record without a policy, which is optional, gives no row.
     """
     rows = []
     for folder in folders:
@@ -32,7 +39,8 @@ def measured_scores(
         if not record.has_policy:
             print(f"no policy in {folder}")
             continue
-        found = evaluate.measured(measurements, record, episodes=episodes, seed=seed)
+        first = own_layouts(seed, episodes, record.seed) if own else seed
+        found = evaluate.measured(measurements, record, episodes=episodes, seed=first)
         name = (name_of(record.task), record.variant, record.seed)
         rows += [(*name, f"eval_{metric}", value) for metric, value in found.items()]
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)

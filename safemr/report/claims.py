@@ -11,7 +11,7 @@ seeds support 95% intervals, not corrections for the number of claims.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -31,12 +31,14 @@ from safemr.report.findings import (
     by_interval,
     describe,
     has_interval,
+    missing_points,
     not_run,
     on_every_task,
     overall,
     surely_below,
     unavailable,
 )
+from safemr.report.second_protocol import judgements
 from safemr.report.statistics import Estimate
 from safemr.report.tables import Table, best_safe_baseline
 
@@ -201,7 +203,7 @@ def safe_but_lower(variant: str, somewhere: bool, evidence: Evidence) -> Finding
 def points_beat_joint_sis(evidence: Evidence) -> Finding:
     """For every [a, b] of Table II: return minus JointSIS's, Welch interval above 0."""
     task = paper.SENSITIVITY_TASK
-    absent = _missing_points(evidence, (*evidence.points, "JointSIS"))
+    absent = missing_points(evidence, (*evidence.points, "JointSIS"))
     if absent:
         return absent
     baseline = evidence.of(task, "JointSIS", "eval_return")
@@ -218,7 +220,7 @@ def points_beat_joint_sis(evidence: Evidence) -> Finding:
 
 def point_costs_vanish(evidence: Evidence) -> Finding:
     """For every [a, b]: violating steps of the final policy at most the tolerance, by interval."""
-    absent = _missing_points(evidence, tuple(evidence.points))
+    absent = missing_points(evidence, tuple(evidence.points))
     if absent:
         return absent
     rule = evidence.rule
@@ -281,8 +283,24 @@ def parameters_feasible(group: str, evidence: Evidence) -> Finding:
 # --- the list ------------------------------------------------------------------------------------
 
 
-def claims(tasks: Sequence[str] = paper.TASKS) -> list[Claim]:
-    """Every claim of the paper that the repository judges, in the paper's order."""
+def claims(tasks: Sequence[str] = paper.TASKS, protocol: int = 1) -> list[Claim]:
+    """Every claim of the paper that the repository judges, in the paper's order.
+
+    protocol: 1, or 2, which judges some of them otherwise (`second_protocol`).
+    """
+    listed = _first_protocol(tasks)
+    if protocol == 1:
+        return listed
+    others = judgements(tuple(tasks))
+    return [
+        replace(claim, measure=others[claim.name].measure, judge=others[claim.name].judge)
+        if claim.name in others
+        else claim
+        for claim in listed
+    ]
+
+
+def _first_protocol(tasks: Sequence[str]) -> list[Claim]:
     listed = [
         Claim(
             "conservativeness", "The unsafe set learned by SafeMR is smaller than JointSIS's",
@@ -374,10 +392,10 @@ def claims(tasks: Sequence[str] = paper.TASKS) -> list[Claim]:
     ]  # fmt: skip
 
 
-def claims_table(evidence: Evidence) -> Table:
+def claims_table(evidence: Evidence, protocol: int = 1) -> Table:
     """A row a claim: statement, measure, our number with its interval, verdict, why, figure."""
     rows = []
-    for claim in claims(evidence.tasks):
+    for claim in claims(evidence.tasks, protocol):
         finding = claim.judge(evidence)
         rows.append([claim.name, claim.statement, claim.measure, *finding.estimate,
                      finding.verdict, finding.reason, claim.figure])  # fmt: skip
@@ -399,9 +417,14 @@ def claims_table(evidence: Evidence) -> Table:
             "figure": data["figure"],
         }
     )  # fmt: skip
+    rules = {
+        1: "by rules of which docs/claims.md says which were changed or added after the first "
+        "reported run",
+        2: "by the second protocol of docs/claims.md",
+    }
     caption = (
-        "Claims of the paper and what these runs say of them, by rules of which docs/claims.md "
-        "says which were changed or added after the first reported run. Not run: nothing that the "
+        f"Claims of the paper and what these runs say of them, {rules[protocol]}. "
+        "Not run: nothing that the "
         "claim is about, a task with the paper's settings, is in this configuration. "
         f"{str(evidence.rule).capitalize()}."
     )
@@ -417,17 +440,3 @@ def _belongs(certificate: str, group: str) -> bool:
 def _asks_for_flights(evidence: Evidence) -> bool:
     expected = evidence.expected
     return expected is None or bool((expected["task"] == paper.AIRCRAFT_TASK).any())
-
-
-def _missing_points(evidence: Evidence, variants: Sequence[str]) -> Finding | None:
-    """The finding where runs of the points are missing, or none is of the paper's task."""
-    task = paper.SENSITIVITY_TASK
-    if evidence.expected is not None and not (
-        evidence.points and evidence.asks_for((task, v) for v in evidence.points)
-    ):
-        return not_run(f"the points [a, b] on {task}")
-    unknown = [p for p in paper.TABLE_II if p not in evidence.points.values()]
-    texts = [f"SafeMR with [a, b] = [{a:g}, {b:g}]" for a, b in unknown]
-    texts.append(evidence.missing((paper.SENSITIVITY_TASK, v) for v in variants))
-    missing = "; ".join(text for text in texts if text)
-    return unavailable(missing) if missing else None

@@ -1,4 +1,4 @@
-"""What the paper's claims are judged by: evidence, findings, and the three kinds of verdict."""
+"""What the paper's claims are judged by: evidence, findings, and the kinds of verdict."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from safemr.report import statistics
 from safemr.report.statistics import Estimate
 from safemr.report.tables import SafetyRule, describe_missing
 
-Verdict = Literal["confirmed", "refuted", "inconclusive", "not run"]
+Verdict = Literal["confirmed", "refuted", "inconclusive", "not testable", "not run"]
 
 NO_INTERVAL = "too few seeds for an interval"
 NOTHING = Estimate(np.nan, np.nan, np.nan, 0)
@@ -143,8 +143,8 @@ def overall(parts: Mapping[str, Finding]) -> Finding:
 
     The estimate is that of the part that decides; the reason names every part.
     """
-    rank: dict[Verdict, int] = {"refuted": 0, "inconclusive": 1, "not run": 1, "confirmed": 2}
-    deciding = min(parts.values(), key=lambda part: rank[part.verdict])
+    rank: dict[Verdict, int] = {"refuted": 0, "confirmed": 2}  # 1: whatever leaves it open
+    deciding = min(parts.values(), key=lambda part: rank.get(part.verdict, 1))
     reason = "; ".join(f"{name}: {part.verdict}, {part.reason}" for name, part in parts.items())
     return Finding(deciding.estimate, deciding.verdict, reason)
 
@@ -204,6 +204,20 @@ def on_every_task(
     found = {task: unavailable(what) if what else judge(task) for task, what in absent.items()}
     parts = {task: finding for task, finding in found.items() if finding is not None}
     return overall(parts) if parts else Finding(NOTHING, "refuted", otherwise)
+
+
+def missing_points(evidence: Evidence, variants: Sequence[str]) -> Finding | None:
+    """The finding where runs of the points are missing, or none is of the paper's task."""
+    task = paper.SENSITIVITY_TASK
+    if evidence.expected is not None and not (
+        evidence.points and evidence.asks_for((task, v) for v in evidence.points)
+    ):
+        return not_run(f"the points [a, b] on {task}")
+    unknown = [p for p in paper.TABLE_II if p not in evidence.points.values()]
+    texts = [f"SafeMR with [a, b] = [{a:g}, {b:g}]" for a, b in unknown]
+    texts.append(evidence.missing((paper.SENSITIVITY_TASK, v) for v in variants))
+    missing = "; ".join(text for text in texts if text)
+    return unavailable(missing) if missing else None
 
 
 def smooth_curves(

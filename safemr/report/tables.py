@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -39,6 +40,7 @@ RESULT_METRICS = {
     "eval_goals": "goals",
     "minutes": "minutes",
 }
+Label = Literal["yes", "no", "not decided"]  # whether it is safe
 _ROUNDING = 1e-9  # a mean of shares like 0.95 may come out a bit below
 PERCENT_DIGITS = {"eval_zero_violation_share": 1, "eval_violation_rate": 3}
 _WHOLE = ("train_violations",)  # counts of thousands
@@ -64,16 +66,21 @@ class SafetyRule:
     cost: str = "eval_cost_indicator"
     clean: str = "eval_zero_violation_share"
 
+    def label(self, scores: pd.DataFrame, task: str, variant: str) -> Label | None:
+        """What a table calls it, or None where there is no such run."""
+        return {True: "yes", False: "no", None: None}[self.is_safe(scores, task, variant)]  # type: ignore[return-value]
+
     def is_safe(self, scores: pd.DataFrame, task: str, variant: str) -> bool | None:
         """True or False by the mean over seeds, or None where there is no such run."""
         cost = statistics.scores_of(scores, task, variant, self.cost)
         clean = statistics.scores_of(scores, task, variant, self.clean)
         if not len(cost) or not len(clean):
             return None
-        return bool(
-            cost.mean() <= self.tolerance + _ROUNDING
-            and clean.mean() >= self.clean_share - _ROUNDING
-        )
+        return bool(self.holds(cost.mean(), clean.mean()))
+
+    def holds(self, cost: pd.Series, clean: pd.Series) -> pd.Series:
+        """Whether these violating steps an episode and shares of clean episodes are safe, each."""
+        return (cost <= self.tolerance + _ROUNDING) & (clean >= self.clean_share - _ROUNDING)
 
     def safe_returns(self, scores: pd.DataFrame) -> pd.DataFrame:
         """`scores` with the eval_return of every run that is not safe by itself set to the worst.
@@ -86,12 +93,7 @@ class SafetyRule:
         wide = scores[scores["metric"].isin([self.cost, self.clean])]
         wide = wide.pivot_table(index=keys, columns="metric", values="value")
         wide = wide.reindex(columns=[self.cost, self.clean])
-        unsafe = wide[
-            ~(
-                (wide[self.cost] <= self.tolerance + _ROUNDING)
-                & (wide[self.clean] >= self.clean_share - _ROUNDING)
-            )
-        ]
+        unsafe = wide[~self.holds(wide[self.cost], wide[self.clean])]
         index = pd.MultiIndex.from_frame(scores[keys])
         returns = scores["metric"] == "eval_return"
         lost = index.isin(unsafe.index) & returns.to_numpy()
@@ -171,11 +173,11 @@ def table_one(
     rule = rule or SafetyRule()
     rows = [_table_one_row(scores, task, rule, method, baselines) for task in tasks]
     papers = [paper.TABLE_I.get(task) for task in tasks]
-    data = pd.DataFrame(rows)
+    data = pd.DataFrame(rows).drop(columns="label")
     lines: dict[str, list[str]] = {
         method: [
             plus_minus(r["safemr"], r["safemr_low"], r["safemr_high"], 2)
-            + ("" if r["safemr_safe"] in (True, None) else " (not safe)")
+            + {"no": " (not safe)", "not decided": " (safety not decided)"}.get(r["label"], "")
             for r in rows
         ],
         "Highest among safe baselines": [
@@ -231,12 +233,13 @@ def full_results(
     metrics: Mapping[str, str] = RESULT_METRICS,
     name: str = "results",
     layouts: int = 10,
+    flown: int = 0,
 ) -> Table:
     """Every algorithm on every task; scripted reference lines are ordinary entries of `scores`.
 
     `data` has one row per (task, variant, metric) with mean, t interval, IQM and its bootstrap
     interval; the printed cell is `plus_minus`, with the IQM after the return. layouts: how many an
-    evaluation has.
+    evaluation has; flown: how many unseen ones each final policy, if `scores` are of these.
     """
     rule = rule or SafetyRule()
     data = statistics.summarise(scores[scores["metric"].isin(list(metrics))])
@@ -244,14 +247,19 @@ def full_results(
     rows = []
     for task, variant in entries(data, missing):
         chosen = data[(data["task"] == task) & (data["variant"] == variant)].set_index("metric")
-        safe = rule.is_safe(scores, task, variant)
+        safe = rule.label(scores, task, variant)
         cells = [_summary_cell(chosen, metric) for metric in metrics]
         seeds = str(int(chosen["count"].max())) if len(chosen) else MISSING
-        rows.append([task, variant, seeds, {True: "yes", False: "no", None: ABSENT}[safe], *cells])
+        rows.append([task, variant, seeds, safe or ABSENT, *cells])
     display = pd.DataFrame(rows, columns=["task", "algorithm", "seeds", "safe", *metrics.values()])
+    source = (
+        f"flown on {flown} unseen layouts"
+        if flown
+        else f"mean over the last 10% of evaluations, on {layouts} fixed layouts"
+    )
     caption = (
-        "Full results: final performance of the deterministic policy (mean over the last 10% of "
-        f"evaluations, on {layouts} fixed layouts), mean over seeds ± half width of the 95% t "
+        f"Full results: final performance of the deterministic policy ({source}), mean over "
+        "seeds ± half width of the 95% t "
         f"interval, or [its ends] where it is cut off at a bound of the quantity. {FEW} From four "
         "seeds on the IQM in brackets after the return. Cost is the authors' (pillars: contact "
         "steps of the body; hazards: summed depth); any contact counts the robot's nose too; in "
@@ -297,6 +305,7 @@ def _table_one_row(
         "task": task,
         "safemr": own.mean, "safemr_low": own.low, "safemr_high": own.high, "seeds": own.size,
         "safemr_safe": rule.is_safe(scores, task, method),
+        "label": rule.label(scores, task, method),
         "baseline": best, "baseline_return": other.mean,
         "baseline_low": other.low, "baseline_high": other.high, "baseline_seeds": other.size,
         "baseline_runs": sum(map(len, tried)),

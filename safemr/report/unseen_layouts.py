@@ -18,6 +18,7 @@ def table(
     episodes: int,
     rule: SafetyRule | None = None,
     layouts: int = 10,
+    own: bool = False,
     method: str = paper.METHOD,
 ) -> Table:
     """A row an algorithm and task: return, its change against the final evaluations, how far it is
@@ -48,6 +49,7 @@ def table(
             {
                 "task": task, "variant": variant, "seeds": mean.size,
                 "safe": rule.is_safe(flown, task, variant),
+                "label": rule.label(flown, task, variant),
                 "return": mean.mean, "return_low": mean.low, "return_high": mean.high,
                 "change": mean.mean - before.mean() if len(before) else float("nan"),
                 "behind": gap.mean, "behind_low": gap.low, "behind_high": gap.high,
@@ -55,11 +57,11 @@ def table(
                 "violating_episodes": dirty, "episodes": total, "upper_bound": bound,
             }
         )  # fmt: skip
-    data = pd.DataFrame(rows)
+    data = pd.DataFrame(rows).drop(columns="label")
     display = pd.DataFrame(
         [
             [
-                row["task"], row["variant"], str(row["seeds"]), "yes" if row["safe"] else "no",
+                row["task"], row["variant"], str(row["seeds"]), row["label"],
                 plus_minus(row["return"], row["return_low"], row["return_high"], 2),
                 ABSENT if pd.isna(row["change"]) else f"{row['change']:+.2f}",
                 ABSENT if pd.isna(row["behind"])
@@ -73,8 +75,9 @@ def table(
                  f"{method} minus it",
                  "violating steps", "episodes with a violation", "at most"],
     )  # fmt: skip
+    shared = "each seed's own" if own else "the same for all"
     caption = (
-        f"Final policies on {episodes} layouts that no run was evaluated on, the same for all: "
+        f"Final policies on {episodes} layouts that no run was evaluated on, {shared}: "
         "mean over seeds ± half width of the 95% t interval; what it changes against the final "
         f"evaluations on {layouts} layouts; {method}'s return minus this one, with Welch's "
         f"interval; [the ends] of an interval that is cut off at 0. {FEW} At "

@@ -53,6 +53,13 @@ LOGS = f"{RESULTS}/logs"
 # regularizer.
 METHOD = PLAN.grid.first("method", paper.METHOD)
 ABLATION = PLAN.grid.first("ablation", paper.ABLATION)
+SAFE = {
+    "tolerance": CONFIG.cost_tolerance,
+    "clean_share": CONFIG.zero_violation_share,
+    "protocol": CONFIG.protocol,
+}
+# By which scores runs are judged: those of their last evaluations, or of flights on unseen layouts.
+JUDGED = f"{SUMMARY}/{'judged' if CONFIG.protocol == 2 else 'scores'}.csv"
 TARGETS = []  # each rules file adds what `all` must make
 
 

@@ -78,7 +78,7 @@ rule certificates:
 
 rule claims:
     input:
-        scores=rules.aggregate.output.scores,
+        scores=JUDGED,
         progress=rules.aggregate.output.progress,
         certificates=rules.certificates.output.table[0] if WITH_PAPERS or FIRST_RUNS else [],
         aircraft=f"{SUMMARY}/aircraft.csv"
@@ -100,8 +100,7 @@ rule claims:
             for label, point in PLAN.points.items()
             if CONFIG.sensitivity.task == paper.SENSITIVITY_TASK
         },
-        tolerance=CONFIG.cost_tolerance,
-        clean_share=CONFIG.zero_violation_share,
+        **SAFE,
         sources=sources("claims"),
     script:
         "../scripts/claims.py"

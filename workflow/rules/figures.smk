@@ -13,7 +13,7 @@ if PUSH_TASKS:
 
 rule table_1:
     input:
-        scores=rules.aggregate.output.scores,
+        scores=JUDGED,
         runs=rules.aggregate.output.runs,
         controllers=rules.controllers.output[0],
     output:
@@ -31,9 +31,9 @@ rule table_1:
         baselines=PLAN.grid.rivals,
         push=PUSH_TASKS,
         layouts=CONFIG.evaluation.episodes,
+        flown=CONFIG.unseen_layouts.episodes if CONFIG.protocol == 2 else 0,
         expected=expected((*PLAN.navigation, *PLAN.outside)),
-        tolerance=CONFIG.cost_tolerance,
-        clean_share=CONFIG.zero_violation_share,
+        **SAFE,
         sources=sources("tables"),
     script:
         "../scripts/tables.py"
@@ -96,7 +96,7 @@ rule curves:
 
 rule final_scores:
     input:
-        scores=rules.aggregate.output.scores,
+        scores=JUDGED,
     output:
         **figure_outputs(*FINAL_SCORES),
     log:
@@ -106,8 +106,7 @@ rule final_scores:
         **GRID,
         **BUDGET,
         method=METHOD,
-        tolerance=CONFIG.cost_tolerance,
-        clean_share=CONFIG.zero_violation_share,
+        **SAFE,
         sources=sources("final_scores"),
     script:
         "../scripts/final_scores.py"

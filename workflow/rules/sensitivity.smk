@@ -30,7 +30,7 @@ rule sensitivity:
 rule weight_map:
     input:
         progress=rules.aggregate.output.progress,
-        scores=rules.aggregate.output.scores,
+        scores=JUDGED,
         runs=rules.aggregate.output.runs,
     output:
         **figure_outputs("weight_map"),
@@ -40,8 +40,7 @@ rule weight_map:
     threads: 1
     params:
         **LEARNED_AT_POINTS,
-        tolerance=CONFIG.cost_tolerance,
-        clean_share=CONFIG.zero_violation_share,
+        **SAFE,
         sources=sources("weight_map"),
     script:
         "../scripts/weight_map.py"

@@ -1,4 +1,5 @@
 # The final policies on layouts that no run was evaluated on: ten fixed layouts say little of others.
+PROTOCOL_TABLES = ["windows", "training_violations", "power", "power_of_safety"]
 FLOWN = {}
 for run in (*PLAN.navigation, *PLAN.sensitivity):
     if run.path in RECORDED_PATHS:
@@ -20,6 +21,7 @@ rule unseen_layouts:
         folders=lambda wildcards: list(FLOWN[wildcards.task]),
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
         seed=CONFIG.unseen_layouts and CONFIG.unseen_layouts.seed,
+        own=CONFIG.unseen_layouts and CONFIG.unseen_layouts.own,
         lacking=lambda wildcards: without_policy(FLOWN[wildcards.task].values()),
         sources=sources("unseen_layouts"),
     message:
@@ -53,12 +55,59 @@ rule unseen_table:
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
         layouts=CONFIG.evaluation.episodes,
         method=METHOD,
-        tolerance=CONFIG.cost_tolerance,
-        clean_share=CONFIG.zero_violation_share,
+        **SAFE,
+        own=CONFIG.unseen_layouts and CONFIG.unseen_layouts.own,
         sources=sources("unseen_table"),
     script:
         "../scripts/unseen_table.py"
 
 
+# What the second protocol judges: the flights, and of training what is known of its violations.
+rule judged:
+    input:
+        flown=expand(rules.unseen_layouts.output[0], task=FLOWN),
+        scores=rules.aggregate.output.scores,
+    output:
+        f"{SUMMARY}/judged.csv",
+    log:
+        f"{LOGS}/judged.log",
+    threads: 1
+    params:
+        sources=sources("judged"),
+    script:
+        "../scripts/judged.py"
+
+
+# How the second protocol's choices bear on what is said: the window of final evaluations, violations
+# while training, and what this many seeds can see.
+rule protocol:
+    input:
+        judged=rules.judged.output[0],
+        progress=rules.aggregate.output.progress,
+    output:
+        *[
+            report(
+                f"{RESULTS}/tables/{name}.md", caption=f"../report/{name}.rst", category="Tables"
+            )
+            for name in PROTOCOL_TABLES
+        ],
+        table=expand(
+            f"{RESULTS}/tables/{{name}}.{{end}}", name=PROTOCOL_TABLES, end=["csv", "tex"]
+        ),
+    log:
+        f"{LOGS}/protocol.log",
+    threads: 1
+    params:
+        tasks=list(CONFIG.tasks),
+        method=METHOD,
+        baselines=PLAN.grid.rivals,
+        **SAFE,
+        sources=sources("protocol"),
+    script:
+        "../scripts/protocol.py"
+
+
 if CONFIG.unseen_layouts and FLOWN:
     TARGETS += rules.unseen_table.output
+    if CONFIG.protocol == 2:
+        TARGETS += rules.protocol.output

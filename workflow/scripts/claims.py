@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.report import claims, tables
+from safemr.report import claims, second_protocol
 from safemr.report.findings import Evidence
 
 given, params = snakemake.input, snakemake.params
@@ -15,6 +15,6 @@ evidence = Evidence(
     points={variant: (a, b) for variant, (a, b) in params.points.items()},
     aircraft=pd.read_csv(given.aircraft) if given.aircraft else None,
     certificates=pd.read_csv(given.certificates) if given.certificates else None,
-    rule=tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share),
+    rule=second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share),
 )
-claims.claims_table(evidence).write(Path(snakemake.output.markdown).parent)
+claims.claims_table(evidence, params.protocol).write(Path(snakemake.output.markdown).parent)

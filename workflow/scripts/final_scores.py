@@ -6,15 +6,14 @@ import numpy as np
 import pandas as pd
 
 from safemr import paper
-from safemr.report import statistics
+from safemr.report import second_protocol, statistics
 from safemr.report.figures import scores as drawing
 from safemr.report.figures import style
-from safemr.report.tables import SafetyRule
 
 params = snakemake.params
 final = pd.read_csv(snakemake.input.scores)
 final = final[final["task"].isin(params.tasks) & final["variant"].isin(params.variants)]
-rule = SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
+rule = second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share)
 scale = {task: paper.TABLE_I[task].safemr for task in params.tasks if task in paper.TABLE_I}
 pairs = final[["task", "variant"]].drop_duplicates().itertuples(index=False, name=None)
 figures = {

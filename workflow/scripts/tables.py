@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.report import compute, differences, statistics, tables
+from safemr.report import compute, differences, second_protocol, statistics, tables
 
 given, params = snakemake.input, snakemake.params
 learned = pd.read_csv(given.scores)
@@ -13,7 +13,7 @@ scores = pd.concat([learned, pd.read_csv(given.controllers)], ignore_index=True)
 expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 runs = pd.read_csv(given.runs)
 missing = statistics.missing_runs(expected, runs)
-rule = tables.SafetyRule(tolerance=params.tolerance, clean_share=params.clean_share)
+rule = second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share)
 made = [
     tables.table_one(
         learned,
@@ -23,7 +23,9 @@ made = [
         method=params.method,
         baselines=params.baselines,
     ),
-    tables.full_results(scores, missing=missing, rule=rule, layouts=params.layouts),
+    tables.full_results(
+        scores, missing=missing, rule=rule, layouts=params.layouts, flown=params.flown
+    ),
     differences.differences(learned, missing=missing),
     compute.table(runs),
 ]

@@ -13,5 +13,6 @@ with reported_errors():
         [Path(params.root, folder) for folder in params.folders],
         episodes=params.episodes,
         seed=params.seed,
+        own=params.own,
     )
 scores.to_csv(snakemake.output[0], index=False)

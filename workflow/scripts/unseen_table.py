@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.report import differences, tables, unseen_layouts
+from safemr.report import differences, second_protocol, unseen_layouts
 
 params = snakemake.params
 flown = pd.concat([pd.read_csv(path) for path in snakemake.input.flown], ignore_index=True)
@@ -13,8 +13,9 @@ table = unseen_layouts.table(
     pd.read_csv(snakemake.input.scores),
     episodes=params.episodes,
     layouts=params.layouts,
+    own=params.own,
     method=params.method,
-    rule=tables.SafetyRule(params.tolerance, params.clean_share),
+    rule=second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share),
 )
 source = f"{params.episodes} unseen layouts"
 for made in (table, differences.differences(flown, name="unseen_differences", source=source)):

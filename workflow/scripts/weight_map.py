@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.report import sensitivity, statistics, tables
+from safemr.report import second_protocol, sensitivity, statistics
 from safemr.report.figures import scores as drawings
 from safemr.report.figures import style
 
@@ -17,7 +17,7 @@ table = sensitivity.weight_map(
     learned,
     points,
     missing=statistics.missing_runs(expected, pd.read_csv(snakemake.input.runs)),
-    rule=tables.SafetyRule(params.tolerance, params.clean_share),
+    rule=second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share),
     task=params.task,
     method=params.method,
     baseline=params.ablation,
