@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -22,9 +23,13 @@ from safemr.filters.choice import Choice, Span, nearest_safe
 from safemr.filters.models import CriticModel, FunctionModel, PointRobotModel, SimulatorModel
 from safemr.filters.wrapper import FILTER_INFOS, FilteredEnvs
 from safemr.learning.evaluation import play
+from safemr.measure import filters
+from safemr.measure.filters import RandomActions
+from safemr.measure.store import Measurements
 
 TASK = "Pillars-0.15-Goal"
 PHI_H = safemr.EnergyCertificate("phi_h", paper.PHI_H)
+LAYOUTS = {"episodes": 4, "seed": 40_000}
 
 
 def driven(filtered: FilteredEnvs, steps: int) -> None:
@@ -282,3 +287,36 @@ def test_an_environment_that_does_not_say_what_phi_needs_is_told() -> None:
     assert isinstance(FunctionModel(dynamics), FunctionModel)
     with pytest.raises(UserError, match="record_critic: true"):
         CriticModel(type("P", (), {"extras": {}}))
+
+
+# --- policies that nobody trained ----------------------------------------------------------------
+
+
+def test_random_actions_are_held_and_stay_within_the_space() -> None:
+    space = gymnasium.spaces.Box(np.array([-1, 0], np.float32), np.array([1, 0.5], np.float32))
+    policy = RandomActions(space, seed=3)
+    drawn = np.array([policy.act(np.zeros((50, 4))) for _ in range(3 * RandomActions.HELD)])
+    held = drawn.reshape(3, RandomActions.HELD, 50, 2)
+    assert (held == held[:, :1]).all()
+    assert len(np.unique(held[:, 0, :, 0])) == 150  # every world and every draw differ
+    assert ((drawn >= space.low) & (drawn <= space.high)).all()
+    again = RandomActions(space, seed=3)
+    assert np.array_equal(again.act(np.zeros((50, 4))), drawn[0])
+
+
+def test_a_scripted_controller_flies_behind_a_certificate_and_is_kept(tmp_path: Path) -> None:
+    kept = Measurements(tmp_path)
+    flights = [
+        filters.measured_unlearned(kept, "scripted", TASK, certificate, **LAYOUTS)
+        for certificate in (None, PHI_H)
+    ]
+    (alone,), (behind,) = flights[0].values(), flights[1].values()
+    assert list(flights[0]) == ["scripted: ignores obstacles"]
+    assert alone["cost_indicator"] > 0 == behind["cost_indicator"]
+    assert 0 < behind["intervened"] < 1
+    assert alone["intervened"] == 0
+    files = sorted((tmp_path / "measurements/filters").iterdir())
+    changed = [path.stat().st_mtime_ns for path in files]
+    assert len(files) == 2
+    filters.measured_unlearned(kept, "scripted", TASK, PHI_H, **LAYOUTS)
+    assert [path.stat().st_mtime_ns for path in files] == changed

@@ -15,13 +15,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
 import yaml
 
 import safemr
-from safemr import UserError, cli
+from safemr import UserError, cli, paper
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "examples/safety_gymnasium"
@@ -123,6 +124,59 @@ def test_a_batch_is_its_worlds_and_a_mask_leaves_the_others(python: str) -> None
     for envs in (together, *alone):
         envs.close()
         envs.close()
+
+
+def test_one_world_is_a_batch_of_one_that_shows_how_an_episode_ends(python: str) -> None:
+    import safety_bridge  # noqa: F401  (registers the tasks)
+
+    one = gymnasium.make("SafetyPointGoal1-v0", max_episode_steps=5)
+    both = batch(1)
+    assert one.get_wrapper_attr("d_min") == both.d_min
+    for seed in (7, None):  # None: the next episode, which the batch has begun by itself
+        seen, info = one.reset(seed=seed)
+        if seed is not None:
+            observations, infos = both.reset(seed=[seed])
+            np.testing.assert_array_equal(seen, observations[0])
+            np.testing.assert_array_equal(info["d"], infos["d"][0])
+    one.reset(seed=7)
+    action = np.array([-0.4, 0.8])
+    for step in range(1, 6):
+        seen, reward, terminated, truncated, info = one.step(action)
+        observations, rewards, _, _, infos = both.step(action[None])
+        final = infos["final_info"] if step == 5 else infos
+        np.testing.assert_array_equal(info["d"], final["d"][0])
+        assert info["cost"] == final["cost"][0]
+        assert reward == rewards[0]
+        assert not terminated
+        assert truncated == (step == 5)
+    np.testing.assert_array_equal(seen, infos["final_obs"][0])
+    assert not np.array_equal(seen, observations[0])
+    one.close()
+    both.close()
+
+
+def test_one_world_is_kept_out_of_a_hazard_by_a_filter(python: str) -> None:
+    import safety_bridge  # noqa: F401
+
+    hazards = np.random.RandomState(7).uniform(-1.0, 1.0, (3, 2))
+
+    def model(observations: Any, actions: Any) -> Any:
+        """The stand-in moves by a tenth of an action."""
+        away = hazards - (observations[:, None, :2] + 0.1 * actions[:, None])
+        d = np.hypot(*np.moveaxis(away, 2, 0))
+        return d, -(away * actions[:, None]).sum(2) / d
+
+    costs = []
+    for certificate in (None, safemr.EnergyCertificate("phi_0", paper.PHI_0)):
+        env: Any = gymnasium.make("SafetyPointGoal1-v0")
+        if certificate is not None:
+            env = safemr.SafetyFilter(env, certificate, model=model)
+        env.reset(seed=7)
+        steps = [env.step(np.array([-0.4, 0.8]))[4] for _ in range(5)]  # into a hazard
+        costs.append(sum(info["cost"] for info in steps))
+        env.close()
+    assert costs[0] > 0 == costs[1]
+    assert any(info["filter_intervened"] for info in steps)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """The ``filters`` entry of a configuration: which final policies fly behind which certificates.
 
+Each also flies without a filter.
+
 filters:
-  policies: [PPO-L, SafeMR] # labels of `algorithms`; each also flies without a filter
+  policies: [PPO-L, SafeMR, scripted, random] # labels of `algorithms`, or what nobody trained
   certificates: [phi_h, JointSIS, SafeMR] # phi_0, phi_h, or labels: that of the run of equal seed
   episodes: 100
   seed: 20000 # of the first layout
@@ -22,6 +24,8 @@ from safemr.names import unknown
 
 # Certificates that nobody learns, by their names in a configuration.
 HANDCRAFTED = {"phi_0": paper.PHI_0, "phi_h": paper.PHI_H}
+# Policies that nobody learns: the scripted controllers of the task, and random actions.
+UNLEARNED = ("scripted", "random")
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ def read_filters(
         if seed not in seeds:
             raise unknown("seed", seed, map(str, seeds), "filters.seeds")
     return Filters(
-        names("policies", "algorithm", algorithms),
+        names("policies", "policy", {*UNLEARNED, *algorithms}),
         names("certificates", "certificate", {*HANDCRAFTED, *algorithms}),
         integer(section.required("episodes"), "filters.episodes", 1),
         integer(section.get("seed", unseen_seed(min(seeds))), "filters.seed", 0, LARGEST_SEED),

@@ -5,18 +5,21 @@ The certificate may be another run's than the policy's, or handcrafted: a filter
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.environments import info_of
 from safemr.errors import UserError
 from safemr.experiment.filter_entries import HANDCRAFTED
+from safemr.experiment.planning import installed
 from safemr.experiment.record import Record
 from safemr.files import Arrays
 from safemr.filters.models import energy_of
@@ -24,6 +27,7 @@ from safemr.filters.wrapper import FilteredEnvs
 from safemr.learning.episode_statistics import EpisodeStatistics
 from safemr.learning.evaluation import Acts
 from safemr.learning.interface import held
+from safemr.measure.controllers import controllers_of
 from safemr.measure.store import Measurements
 from safemr.measure.tracks import GEOMETRY
 from safemr.tasks import Task, make_envs, name_of
@@ -33,10 +37,38 @@ CHOICES = ("intervened", "distance", "margin", "feasible")  # of `Choice`, for a
 UNFILTERED = ""  # the name of no filter in a score table
 
 
+class RandomActions:
+    """Uniform actions, each held for `HELD` control steps: what learners do before they learn.
+
+    space: of an environment's actions; seed: of the draws, one for each world and new action.
+    """
+
+    HELD = 10
+
+    def __init__(self, space: Box, seed: int) -> None:
+        self._space, self._draw, self._steps = space, np.random.default_rng(seed), 0
+
+    def act(self, observations: Any, deterministic: bool = True) -> NDArray[np.float32]:
+        """Actions [N, A] for observations [N, D], which are not looked at."""
+        if self._steps % self.HELD == 0:
+            low, high = self._space.low, self._space.high
+            size = (len(observations), *low.shape)
+            self._actions = self._draw.uniform(low, high, size).astype(np.float32)
+        self._steps += 1
+        return self._actions
+
+
 def fly(
-    policy: Acts, task: Task, certificate: Certificate | None, *, episodes: int, seed: int
+    make_policy: Callable[[Any], Acts],
+    task: Task,
+    certificate: Certificate | None,
+    *,
+    episodes: int,
+    seed: int,
 ) -> dict[str, float]:
     """A policy behind the filter of a certificate, on ``episodes`` layouts from ``seed`` on.
+
+    make_policy: from the batched environment, which scripted ones look into.
 
     The metrics of `EpisodeStatistics`, and of the filter, over all decisions: the shares
     ``intervened`` and ``infeasible`` (no action found that keeps the constraint), the mean
@@ -44,6 +76,7 @@ def fly(
     processor time that it took for a control step of one world, on this machine.
     """
     envs = make_envs(task, episodes)
+    policy = make_policy(envs)
     repeat = int(getattr(policy, "action_repeat", 1))
     filtered = (
         None if certificate is None else FilteredEnvs(envs, certificate, action_repeat=repeat)
@@ -86,21 +119,56 @@ def measured(
     seed: int,
 ) -> Mapping[str, float]:
     """`fly` of a record's policy, kept among ``measurements``."""
-    said: dict[str, Any] | None = None
-    if certificate is not None:
-        said = {
-            "family": certificate.family, "parameters": dict(certificate.parameters),
-            "eta": certificate.eta, "length_scale": certificate.length_scale,
-            "record": certificate.record and certificate.record.inputs,
-        }  # fmt: skip
-    inputs = {**record.inputs, "certificate": said, "episodes": episodes, "seed": seed}
-    name = "unfiltered" if certificate is None else f"behind {certificate.name}"
+    flight = {"certificate": _inputs_of(certificate), "episodes": episodes, "seed": seed}
     return measurements.rows(
         "filters",
-        f"{record.label} {name}",
-        inputs,
-        lambda: fly(record.policy(), record.task, certificate, episodes=episodes, seed=seed),
+        f"{record.label} {_behind(certificate)}",
+        {**record.inputs, **flight},
+        lambda: fly(
+            lambda _: record.policy(), record.task, certificate, episodes=episodes, seed=seed
+        ),
     )
+
+
+def measured_unlearned(
+    measurements: Measurements,
+    kind: str,
+    task: Task,
+    certificate: Certificate | None,
+    *,
+    episodes: int,
+    seed: int,
+) -> dict[str, Mapping[str, float]]:
+    """`fly` of each policy of a kind of `UNLEARNED` that fits the task, by name, kept."""
+    made: dict[str, Callable[[Any], Acts]] = {
+        kind: lambda envs: RandomActions(envs.single_action_space, seed)
+    }
+    if kind == "scripted":
+        with closing(make_envs(task, 1)) as one:
+            made = dict(controllers_of(one))
+    flight = {"certificate": _inputs_of(certificate), "episodes": episodes, "seed": seed}
+    return {
+        name: measurements.rows(
+            "filters",
+            f"{name_of(task)} {name} {_behind(certificate)}",
+            {"policy": name, "task": installed(task), **flight},
+            lambda make=make: fly(make, task, certificate, episodes=episodes, seed=seed),
+        )
+        for name, make in made.items()
+    }
+
+
+def _inputs_of(certificate: Certificate | None) -> dict[str, Any] | None:
+    """What a flight behind this certificate depends on."""
+    return certificate and {
+        "family": certificate.family, "parameters": dict(certificate.parameters),
+        "eta": certificate.eta, "length_scale": certificate.length_scale,
+        "record": certificate.record and certificate.record.inputs,
+    }  # fmt: skip
+
+
+def _behind(certificate: Certificate | None) -> str:
+    return "unfiltered" if certificate is None else f"behind {certificate.name}"
 
 
 def measured_scores(
@@ -110,8 +178,13 @@ def measured_scores(
     *,
     episodes: int,
     seed: int,
+    unlearned: Sequence[str] = (),
+    task: Task = "",
+    seeds: Sequence[int] = (),
 ) -> pd.DataFrame:
     """Score table of the records ``policies``, each without a filter and behind each certificate.
+
+    Then of ``unlearned`` policies (`UNLEARNED`) in ``task``, behind the certificates of ``seeds``.
 
     certificates: name -> records of the runs that learned it, of which the one with the policy's
     seed is taken; none for a handcrafted one (`HANDCRAFTED`). A record without a policy gives no
@@ -122,24 +195,38 @@ def measured_scores(
         for name, folders in certificates.items()
         for record in map(Record.open, folders)
     }
+
+    def behind(seed: int) -> Iterator[tuple[str, Certificate | None]]:
+        yield UNFILTERED, None
+        for name in certificates:
+            if name in HANDCRAFTED:
+                yield name, handcrafted(name)
+            elif (name, seed) in learned:
+                yield name, learned[name, seed].certificate()
+            else:
+                print(f"no run of {name} with seed {seed}")
+
     rows: list[tuple[Any, ...]] = []
     for folder in policies:
         record = Record.open(folder)
         if not record.has_policy:
             print(f"no policy in {folder}")
             continue
-        for name in (UNFILTERED, *certificates):
-            certificate: Certificate | None = None
-            if name in HANDCRAFTED:
-                certificate = handcrafted(name)
-            elif name and (name, record.seed) not in learned:
-                print(f"no run of {name} with seed {record.seed}")
-                continue
-            elif name:
-                certificate = learned[name, record.seed].certificate()
+        for name, certificate in behind(record.seed):
             found = measured(measurements, record, certificate, episodes=episodes, seed=seed)
             key = (name_of(record.task), record.variant, name, record.seed)
             rows += [(*key, metric, value) for metric, value in found.items()]
+    for kind in unlearned:
+        for run in seeds:
+            for name, certificate in behind(run):
+                flown = measured_unlearned(
+                    measurements, kind, task, certificate, episodes=episodes, seed=seed
+                )
+                rows += [
+                    (name_of(task), policy, name, run, metric, value)
+                    for policy, found in flown.items()
+                    for metric, value in found.items()
+                ]
     return pd.DataFrame(rows, columns=SCORES)
 
 

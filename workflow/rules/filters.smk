@@ -42,6 +42,7 @@ rule filters:
         root=RESULTS,
         tasks=[
             {
+                "task": entries_of([task])[0],
                 "policies": [
                     path
                     for label in FILTERS.policies
@@ -51,8 +52,12 @@ rule filters:
                     name: paths_of(variants.get(name, [])) for name in FILTERS.certificates
                 },
             }
-            for variants in FILTERED.values()
+            for task, variants in FILTERED.items()
         ],
+        unlearned=[name for name in FILTERS.policies if name not in CONFIG.algorithms]
+        if FILTERS
+        else [],
+        seeds=list(FILTERS.seeds) if FILTERS else [],
         episodes=FILTERS and FILTERS.episodes,
         seed=FILTERS and FILTERS.seed,
         lacking=without_policy(

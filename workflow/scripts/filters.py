@@ -26,6 +26,9 @@ with reported_errors():
             {name: folders(runs) for name, runs in task["certificates"].items()},
             episodes=params.episodes,
             seed=params.seed,
+            unlearned=params.unlearned,
+            task=task["task"],
+            seeds=params.seeds,
         )
         for task in params.tasks
     ]

@@ -9,6 +9,7 @@ for _robot in ROBOTS:
     for _task in TASKS:
         gymnasium.register(
             id=f"Safety{_robot}{_task}-v0",
+            entry_point="safety_bridge.world:SafetyWorld",
             vector_entry_point="safety_bridge.batch:SafetyBatch",
             max_episode_steps=1000,
             kwargs={"name": f"Safety{_robot}{_task}-v0"},
