@@ -78,7 +78,8 @@ def scene(task: str) -> str:
     """A registered task in a line."""
     envs = make_envs(task, 1)
     count, steps = envs.num_obstacles, traits(envs).episode_steps
-    sizes = [math.prod(space.shape) for space in (envs.observation_space, envs.action_space)]
+    spaces = (envs.single_observation_space, envs.single_action_space)
+    sizes = [math.prod(space.shape) for space in spaces]
     envs.close()
     return (
         f"{count} obstacle{'s' * (count != 1)}, d_min {envs.d_min:g} m, "
