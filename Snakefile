@@ -60,6 +60,7 @@ localrules:
     table_1,
     unseen_layouts,
     unseen_table,
+    verdicts,
     weight_map,
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from safemr.experiment import overview, train
+from safemr.experiment import train
 from safemr.learning import contract
+from safemr.report import recorded
 
 ROOT = Path(__file__).resolve().parents[1]
 TASK, NAME = "Hazards-0.15-Push", "Short-Push"
@@ -45,7 +46,7 @@ def test_a_diverging_run_ends_in_one_line_and_is_named(
         lines[0],
     )
     assert not list(tmp_path.glob("runs/*/*/*"))
-    assert overview.main([str(tmp_path)]) == 0
+    assert recorded.main([str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert f"{name} {NAME} seed 100" in printed
     assert "failed: " in printed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 import typing
@@ -260,7 +261,11 @@ def test_the_overview_names_every_task_and_algorithm(capsys: pytest.CaptureFixtu
     assert listing.main([]) == 0
     lines = capsys.readouterr().out.splitlines()
     for task in planning.task_names():
-        assert f"  {task}" in lines
+        (line,) = (line for line in lines if line.split()[:1] == [task])
+        assert re.search(r"\d obstacles?, d_min [\d.]+ m, episodes of [\d,]+ steps", line)
+    for file in (ROOT / "config").glob("*.yaml"):
+        (line,) = (line for line in lines if line.split()[:1] == [file.name])
+        assert len(line.split()) > 2
     for name in planning.algorithm_names():
         (line,) = (line for line in lines if line.split()[:1] == [name])
         assert line.split()[1] == planning.load_algorithm(name).family
@@ -286,6 +291,17 @@ def test_an_algorithm_is_listed_with_type_default_and_meaning(
     assert all(f"{name} (o" in printed for name in planning.algorithm_names())
     with pytest.raises(UserError, match="did you mean 'ppo_lagrangian'"):
         listing.main(["ppo"])
+
+
+def test_a_task_is_listed_with_its_settings(capsys: pytest.CaptureFixture[str]) -> None:
+    assert listing.main(["Hazards-0.30-Push", "Aircraft"]) == 0
+    push, aircraft = capsys.readouterr().out.split("\n\n")
+    for name, value in (("obstacle_size", "0.3"), ("max_episode_steps", "1000")):
+        assert re.search(rf"^  {name} += {value}$", push, re.MULTILINE)
+    assert "MuJoCo's sleep flag" in push
+    assert re.search(r"^  max_episode_steps +(= 200)$", aircraft, re.MULTILINE)
+    with pytest.raises(UserError, match=r"unknown task 'Hazards-0\.31-Push'.*did you mean"):
+        listing.main(["Hazards-0.31-Push"])
 
 
 def test_the_help_of_train_says_what_there_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,11 +18,13 @@ from hypothesis import strategies as st
 from sample_record import CONFIG, POLICY, make_record
 
 from safemr import files
-from safemr.experiment import overview, records
+from safemr.errors import UserError
+from safemr.experiment import records
 from safemr.experiment.checkpoints import RunSession
 from safemr.experiment.record import Record
 from safemr.experiment.records import RecordError
 from safemr.measure import certify
+from safemr.report import recorded, statistics
 
 
 @pytest.fixture
@@ -249,15 +251,54 @@ def test_writing_again_after_a_crash_in_between(record: Path, tmp_path: Path) ->
     records.verify_record(record)
 
 
+def test_records_are_listed_and_filtered(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for variant, seed in (("SafeMR", 0), ("SafeMR[0.45,0.15]", 0), ("SafeMR", 1)):
+        config = {**CONFIG, "seed": seed}
+        rows = [
+            {"step": step, "eval_return": step + seed, "eval_cost": 0.0,
+             "eval_cost_indicator": 0.5, "eval_zero_violation_share": 0.75}
+            for step in (10, 20)
+        ]  # fmt: skip
+        source = {"source": {"commit": "0123456789abcdef", "dirty": seed == 1}, "wall_s": 90.0}
+        folder = tmp_path / records.record_path(config, variant)
+        records.write_record(folder, config, variant, rows, source)
+
+    def listed(*arguments: str) -> list[list[str]]:
+        assert recorded.main([str(tmp_path), *arguments]) == 0
+        head, *rows = capsys.readouterr().out.split("\n\n")[0].splitlines()
+        assert head.split()[:3] == ["task", "variant", "seed"]
+        return [row.split() for row in rows]
+
+    everything = listed()
+    assert [row[1:3] for row in everything] == [
+        ["SafeMR", "0"], ["SafeMR", "1"], ["SafeMR[0.45,0.15]", "0"]
+    ]  # fmt: skip
+    _, progress = records.read_records(tmp_path)  # the tables' own rule of what is final
+    finals = statistics.final_scores(progress)
+    finals = finals[(finals["metric"] == "eval_return") & (finals["variant"] == "SafeMR")]
+    assert [float(row[5]) for row in everything[:2]] == finals["value"].tolist()
+    assert everything[1][6:] == ["0.50", "75.0%", "1.5", "0123456*"]
+    assert everything[0][3] in str(next(tmp_path.glob("runs/*/SafeMR/seed0-*")))
+    # A label with brackets is itself before it is a pattern.
+    assert listed("--variant", "SafeMR[0.45,0.15]") == everything[2:]
+    assert listed("--variant", "SafeMR", "--seed", "1") == everything[1:2]
+    assert listed("--task", "Pillars*", "--variant", "*") == everything
+    assert listed("--variant", "SafeMR", "SafeMR*") == everything
+    with pytest.raises(UserError, match=r"unknown variant 'SafeMr' in these records; did you mean"):
+        recorded.main([str(tmp_path), "--variant", "SafeMr"])
+
+
 def test_the_overview_names_faults_and_unfinished_runs(
     record: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert overview.main([str(tmp_path)]) == 0
+    assert recorded.main([str(tmp_path)]) == 0
     with RunSession({**CONFIG, "seed": 101}, "FAC-phih", tmp_path) as session:
         session.resume()
         session.fail("critic_loss became inf at step 10")
     edit("progress.csv", lambda t: "")(record)
-    assert overview.main([str(tmp_path)]) == 1
+    assert recorded.main([str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     assert str(record) in printed
     assert "FAC-phih Pillars-0.15-Goal seed 101" in printed

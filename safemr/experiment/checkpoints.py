@@ -32,10 +32,13 @@ import torch
 from safemr import files, packages
 from safemr.errors import UserError, tell
 from safemr.experiment import provenance, records
+from safemr.experiment.begun import ATTEMPTS as ATTEMPTS
+from safemr.experiment.begun import LOCK as LOCK
+from safemr.experiment.begun import read_attempts as read_attempts
 from safemr.experiment.locks import ProcessLock
 from safemr.experiment.signals import StopSignals
 
-CHECKPOINT, ATTEMPTS, LOCK = "checkpoint.pt", "attempts.jsonl", "lock"
+CHECKPOINT = "checkpoint.pt"
 SHARE = 0.02  # the largest share of the run time that checkpoints may take
 # Of checkpoint files: those before 2 did not keep the order of arrays in memory.
 FORMAT, _FORMAT_KEY = 2, "format"
@@ -106,15 +109,6 @@ def load(path: Path) -> dict[str, Any]:
     if content.pop(_FORMAT_KEY, 1) != FORMAT:
         raise UserError(f"{path} was written by another version of this program")
     return content
-
-
-def read_attempts(work: Path) -> list[dict[str, Any]]:
-    """The attempts at an unfinished run, and how they failed; a torn line is left out."""
-    events = []
-    for line in (work / ATTEMPTS).read_text().splitlines():
-        with contextlib.suppress(ValueError):
-            events.append(json.loads(line))
-    return events
 
 
 def _outside(algorithm: Mapping[str, Any]) -> dict[str, Any]:

@@ -23,20 +23,20 @@ class Cost(NamedTuple):
 
 def announced(root: Path, runs: Sequence[Run]) -> list[str]:
     """Lines about those of ``runs`` that have no record under ``root``; none when all have one."""
-    opened = [(run, _opened(root / run.path)) for run in runs]
+    opened = [(run, opened_at(root / run.path)) for run in runs]
     missing = [run for run, record in opened if record is None]
     if not missing:
         return []
-    known = list(_costs(record for _, record in opened if record is not None))
-    seconds = [_estimate(run, known) for run in missing]
+    known = list(costs(record for _, record in opened if record is not None))
+    seconds = [estimate(run, known) for run in missing]
     estimated = sum(value for value in seconds if value is not None)
     unknown = sum(value is None for value in seconds)
-    time = f"about {_time(estimated)} by the records here"
+    time = f"about {duration(estimated)} by the records here"
     if unknown:
         time = "for how long no record tells"
         if estimated:
-            time = f"about {_time(estimated)} and {_count(unknown, 'run')} of unknown length"
-    lines = [f"To be trained: {_count(len(missing), 'run')}, {time}"]
+            time = f"about {duration(estimated)} and {counted(unknown, 'run')} of unknown length"
+    lines = [f"To be trained: {counted(len(missing), 'run')}, {time}"]
     for variant in dict.fromkeys(run.variant for run in missing):
         counts: dict[str, int] = {}
         for run in missing:
@@ -58,14 +58,16 @@ def left_out(tasks: Mapping[str, Described]) -> list[str]:
     ]
 
 
-def _opened(folder: Path) -> Record | None:
+def opened_at(folder: Path) -> Record | None:
+    """The record in a folder, or None where there is none that can be believed."""
     try:
         return Record.open(folder)
     except RecordError:
         return None
 
 
-def _costs(recorded: Iterable[Record]) -> Iterator[Cost]:
+def costs(recorded: Iterable[Record]) -> Iterator[Cost]:
+    """What those records took that say it."""
     for record in recorded:
         if (seconds := record.provenance.get("cpu_s")) is None:
             continue  # an outside record need not say it
@@ -74,7 +76,7 @@ def _costs(recorded: Iterable[Record]) -> Iterator[Cost]:
         yield Cost(name_of(record.task), names, record.algorithm, per_step)
 
 
-def _estimate(run: Run, known: Sequence[Cost]) -> float | None:
+def estimate(run: Run, known: Sequence[Cost]) -> float | None:
     """CPU seconds of a run: the mean a step of the most similar algorithm recorded on its task.
 
     All runs of a plan meet a task through one interface, so a decision takes as many steps.
@@ -94,10 +96,12 @@ def _estimate(run: Run, known: Sequence[Cost]) -> float | None:
     return float(run.config["steps"] * sum(rates) / len(rates))
 
 
-def _time(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """Processor time in words."""
     minutes = seconds / 60
     return f"{minutes / 60:.1f} core-hours" if minutes >= 90 else f"{minutes:.0f} core-minutes"
 
 
-def _count(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
+    """``1 run``, ``2 runs``."""
     return f"{number} {noun}{'' if number == 1 else 's'}"

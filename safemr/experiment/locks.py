@@ -16,6 +16,8 @@ from pathlib import Path
 
 from safemr.errors import UserError, tell
 
+_GLANCE = 0.05  # seconds after which who only looked (`is_held`) has looked
+
 
 class LockedError(UserError):
     """Another live process holds the lock."""
@@ -35,7 +37,10 @@ class ProcessLock:
 
         ``while_waiting`` is called twice a second and may raise to give up.
         """
+        if self._try():
+            return
         announced = False
+        time.sleep(_GLANCE)
         while not self._try():
             owner = self._owner()
             if not wait:
@@ -79,3 +84,18 @@ class ProcessLock:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
+
+
+def is_held(path: Path) -> bool:
+    """Whether a live process holds the lock file; one that takes it meanwhile tries again."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
+    finally:
+        os.close(descriptor)
+    return False

@@ -1,46 +1,44 @@
-"""``safemr records``: which records can be believed, and what is unfinished."""
+"""What stands under a results root: records, those with a fault, and unfinished runs; as text."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from safemr.experiment import checkpoints, records
+from safemr.experiment.begun import begun
+from safemr.experiment.record import Record
+from safemr.experiment.records import RecordError
 
 
-def faults(root: Path) -> Iterator[tuple[Path, str | None]]:
-    """Every record folder under a results root with its fault, or None where it has none."""
+def opened(root: Path) -> Iterator[Record | RecordError]:
+    """Every record under a results root, or what is wrong with it, in the order of folders."""
     for folder in sorted(path for path in root.glob("runs/*/*/*") if path.is_dir()):
         try:
-            records.verify_record(folder)
-        except records.RecordError as error:
-            yield folder, str(error)
-        else:
-            yield folder, None
+            yield Record.open(folder)
+        except RecordError as error:
+            yield error
 
 
 def unfinished(root: Path) -> Iterator[str]:
     """One line for each run that was begun and has no record yet."""
-    for work in sorted(path for path in (root / ".work").glob("*") if path.is_dir()):
-        try:
-            last = checkpoints.read_attempts(work)[-1]
-        except (OSError, IndexError):
-            continue
-        state = f"failed: {last['reason']}" if "reason" in last else "unfinished"
-        yield f"{last['run']} ({work}) {state}"
+    for run in begun(root):
+        state = "in training" if run.running else "unfinished"
+        state = f"failed: {run.failure}" if run.failure is not None else state
+        yield f"{run.label} ({run.work}) {state}, at step {run.step}"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print every fault and every unfinished run; exit status 1 where a record has a fault."""
-    parser = argparse.ArgumentParser("safemr records", description=__doc__)
-    parser.add_argument("root", nargs="?", type=Path, default=Path("results"))
-    root = parser.parse_args(arguments).root
-    found = list(faults(root))
-    broken = [fault for _, fault in found if fault]
-    for fault in broken:
-        print(fault)
-    for line in unfinished(root):
-        print(line)
-    print(f"{len(found) - len(broken)} records verified, {len(broken)} refused")
-    return 1 if broken else 0
+def aligned(rows: Sequence[Sequence[str]], left: int) -> list[str]:
+    """Rows of cells as lines of columns: the first ``left`` ones flush left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if index < left else cell.rjust(width)
+            for index, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def number(value: float, digits: int = 2) -> str:
+    """A number in a cell; a dash where there is none."""
+    return "-" if value != value else f"{value:.{digits}f}"

@@ -1,21 +1,23 @@
 """Tables inside documents: `safemr documents FILE...` puts in what the pipeline made.
 
 Between the lines ``<!-- table: PATH -->`` and ``<!-- end of table -->`` of a document stands the
-content of PATH, relative to the document. With ``--check`` nothing is written; the exit status says
-whether anything would change.
+content of PATH, relative to the document; links in it lead where they led from its own place. With
+``--check`` nothing is written; the exit status says whether anything would change.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from safemr import files
 from safemr.errors import UserError
 
 _TABLE = re.compile(r"(?ms)^<!-- table: (?P<path>\S+) -->\n.*?^<!-- end of table -->$")
+_LINK = re.compile(r"\]\((?P<path>(?![a-z]+:|[#/])[^)#\s]+)")
 
 
 def with_tables(document: Path) -> str:
@@ -27,8 +29,10 @@ def with_tables(document: Path) -> str:
 
     def fresh(match: re.Match[str]) -> str:
         path = match["path"]
-        table = _read(document.parent / path, f"named in {document}; make it with `make.py all`")
-        return f"<!-- table: {path} -->\n{table.strip()}\n<!-- end of table -->"
+        source = document.parent / path
+        table = _read(source, f"named in {document}; make it with `make.py all`").strip()
+        table = _moved(table, source.parent, document.parent)
+        return f"<!-- table: {path} -->\n{table}\n<!-- end of table -->"
 
     return _TABLE.sub(fresh, _read(document, "no such document"))
 
@@ -49,6 +53,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if stale:
         print(f"{'not current' if options.check else 'updated'}: {', '.join(stale)}")
     return 1 if stale and options.check else 0
+
+
+def _moved(text: str, source: Path, target: Path) -> str:
+    """Markdown whose relative links are from ``source`` as it stands in ``target``."""
+
+    def link(match: re.Match[str]) -> str:
+        moved = os.path.relpath(source / match["path"], target)
+        return f"]({PurePath(moved).as_posix()}"
+
+    return _LINK.sub(link, text)
 
 
 def _read(path: Path, otherwise: str) -> str:

@@ -106,6 +106,27 @@ rule claims:
         "../scripts/claims.py"
 
 
+# The front page's table, of what has all of the paper's tasks.
+rule verdicts:
+    input:
+        claims=rules.claims.output.table[0],
+        runs=rules.aggregate.output.runs,
+    output:
+        report(
+            f"{RESULTS}/tables/verdicts.md", caption="../report/verdicts.rst", category="Claims"
+        ),
+    log:
+        f"{LOGS}/verdicts.log",
+    threads: 1
+    params:
+        figures=FIGURES,
+        sources=sources("verdicts"),
+    script:
+        "../scripts/verdicts.py"
+
+
 TARGETS += [*rules.claims.output]
+if set(PAPER_TASKS) == set(paper.TASKS):
+    TARGETS += [*rules.verdicts.output]
 if WITH_PAPERS or FIRST_RUNS:
     TARGETS += [*rules.certificates.output]
