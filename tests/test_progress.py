@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -67,6 +69,21 @@ def test_the_time_left_is_shared_by_what_trains_now(tmp_path: Path) -> None:
         "Left: about 4.0 core-hours; 4.0 hours, 1 at a time as now"
     )
     session.__exit__(None, None, None)
+
+
+def test_a_watch_ends_with_its_reader(tmp_path: Path) -> None:
+    chosen = {"results_root": str(tmp_path / "results"), "sensitivity": None, "aircraft": None}
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(chosen))
+    command = [sys.executable, "-m", "safemr.cli", "progress", "--watch", "0.1"]
+    reading, writing = os.pipe()
+    watch = subprocess.Popen(
+        [*command, "--configfile", str(tmp_path / "c.yaml")], stdout=writing, stderr=subprocess.PIPE
+    )
+    os.close(writing)
+    assert b"0 of " in os.read(reading, 4096)
+    os.close(reading)
+    _, said = watch.communicate(timeout=300)
+    assert (watch.returncode, said) == (0, b"")
 
 
 def test_a_watch_ends_with_the_last_record(

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from safemr.errors import UserError, tell
+from safemr.errors import UserError
 from safemr.experiment import config
 from safemr.experiment.begun import Begun, begun
 from safemr.experiment.forecast import costs, counted, duration, estimate, opened_at
@@ -161,9 +162,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         while True:
             text = "\n".join(grid.lines())
             clear = _CLEAR if options.watch is not None and sys.stdout.isatty() else ""
-            tell(clear + text, sys.stdout)
+            print(clear + text, flush=True)
             if options.watch is None or not grid.missing:
                 return 0
             time.sleep(options.watch)
     except KeyboardInterrupt:
+        return 0
+    except BrokenPipeError:  # whoever read has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nor will the exit flush
         return 0
