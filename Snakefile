@@ -21,6 +21,7 @@ include: "workflow/rules/sizes.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/sensitivity.smk"
 include: "workflow/rules/aircraft.smk"
+include: "workflow/rules/page.smk"
 
 
 onstart:
@@ -51,6 +52,7 @@ localrules:
     filters,
     final_scores,
     illustrations,
+    page,
     policies,
     rollouts,
     sensitivity,
