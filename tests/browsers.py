@@ -20,7 +20,7 @@ KNOWN = {
     "Firefox": ("firefox-esr", "firefox"),
 }
 KEYS = {"Tab": ("\t", 9, "\ue004"), "Enter": ("\r", 13, "\ue007")}  # text, code, WebDriver's
-PATIENCE_S = 180.0  # a busy machine takes a minute to start a browser
+PATIENCE_S = 120.0  # a busy machine takes a minute to start a browser
 
 
 class Browser:
@@ -43,7 +43,7 @@ class Browser:
 
     def until(self, condition: str) -> bool:
         """Whether it comes true while one waits."""
-        end = time.monotonic() + 20.0
+        end = time.monotonic() + PATIENCE_S
         while not (found := bool(self(condition))) and time.monotonic() < end:
             time.sleep(0.1)
         return found
