@@ -21,6 +21,7 @@ include: "workflow/rules/sizes.smk"
 include: "workflow/rules/figures.smk"
 include: "workflow/rules/sensitivity.smk"
 include: "workflow/rules/aircraft.smk"
+include: "workflow/rules/page.smk"
 
 
 onstart:
@@ -52,6 +53,7 @@ localrules:
     final_scores,
     illustrations,
     judged,
+    page,
     policies,
     protocol,
     rollouts,

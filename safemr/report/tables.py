@@ -120,9 +120,9 @@ class Table:
 
     def markdown(self) -> str:
         """GitHub Markdown: caption, table, notes."""
-        head, *body = _cells(self.display)
+        head, *body = [[cell.replace("|", "\\|") for cell in row] for row in _cells(self.display)]
         lines = [f"**{self.caption}**", "", _row(head), _row(["---"] * len(head))]
-        lines += [_row([cell.replace("|", "\\|") for cell in row]) for row in body]
+        lines += map(_row, body)
         return "\n".join([*lines, *(f"\n{note}" for note in self.notes)]) + "\n"
 
     def latex(self) -> str:

@@ -176,7 +176,9 @@ rule policies:
         expand(rules.rollouts.output[0], task=ROBOT_TASKS),
     output:
         **figure_outputs("multiplier_maps", *(f"trajectories/{task}" for task in ROBOT_TASKS)),
-        animation=f"{FIGURES}/rollout.gif",
+        animation=report(
+            f"{FIGURES}/rollout.gif", caption="../report/rollout.rst", category="Figures"
+        ),
         missing=f"{SUMMARY}/missing_policies.csv",
     log:
         f"{LOGS}/policies.log",
