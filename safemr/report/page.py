@@ -36,6 +36,7 @@ from safemr.report.tables import ABSENT
 
 ASSETS = Path(__file__).with_name("assets")
 FRONT = ("finding", "table1", "claims")  # placed by the template
+ELSEWHERE = ("verdicts",)  # the claims once more, for README
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,9 @@ def write(
             reStructuredText; each with its name.
     """
     panels = {
-        path.stem: Panel(path, captions.get(str(path), ""), printed.read(path)) for path in tables
+        path.stem: Panel(path, captions.get(str(path), ""), printed.read(path))
+        for path in tables
+        if path.stem not in ELSEWHERE
     }
     shown = [Picture(path, name, captions.get(str(path), "")) for path, name in pictures.items()]
     groups = _records(runs)

@@ -4,13 +4,8 @@ from types import SimpleNamespace
 from jinja2 import Environment, StrictUndefined
 from snakemake.io import is_flagged
 
-# The claims themselves stand there, not the short table of their verdicts for README.
 SHOWN = {
-    end: [
-        str(path)
-        for path in TARGETS
-        if str(path).endswith(end) and not str(path).endswith("/verdicts.md")
-    ]
+    end: [str(path) for path in TARGETS if str(path).endswith(end)]
     for end in (".md", ".png", ".gif")
 }
 
