@@ -22,6 +22,7 @@ figures = {
         final,
         params.tasks,
         tolerance=params.tolerance,
+        clean_share=params.clean_share,
         unsafe=[pair for pair in pairs if not rule.is_safe(final, *pair)],
     )
 }
@@ -33,7 +34,7 @@ if scale:  # the paper's return is the unit
     thresholds = np.linspace(min(-0.5, low), max(2.0, high), 121)
     for chosen, file, name in (
         (final, "aggregate_scores", "return"),
-        (rule.safe_returns(final), "aggregate_safe_scores", "safe return"),
+        (rule.safe_returns(final), "aggregate_safe_scores", "return if safe, else the worst,"),
     ):
         aggregates = statistics.aggregate(chosen, params.variants, params.method, scale, thresholds)
         figures[file] = drawing.aggregate_scores(
