@@ -147,6 +147,16 @@ def test_wide_intervals_do_not_flatten_the_curves():
     assert 10 <= high < 17
 
 
+def test_a_peak_between_whiskers_is_in_the_view():
+    rows = [(name, step, 9.0 * (step == 1)) for name in ("a", "b") for step in range(4)]
+    table = pd.DataFrame(rows, columns=["variant", "step", "mean"])
+    ax = style.new_figure(3, 2).subplots()
+    curves.draw_curves(table.assign(low=table["mean"], high=table["mean"]), ax)
+    assert ax.get_ylim()[1] > 9.0
+    curves.cost_axis(ax, "cost")
+    assert ax.get_ylim()[1] > 9.0
+
+
 def variations(names: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Learning curves and minutes of variants on one task."""
     rows = [

@@ -40,7 +40,8 @@ def draw_curves(
         bottom, top = curves["mean"].min(), curves["mean"].max()
         reach = 0.5 * max(top - bottom, 1e-3)
         ends = pd.concat(shown)[["low", "high"]].fillna({"low": bottom, "high": top})
-        low, high = max(bottom - reach, ends["low"].min()), min(top + reach, ends["high"].max())
+        low = min(max(bottom - reach, ends["low"].min()), bottom)
+        high = max(min(top + reach, ends["high"].max()), top)
         margin = 0.05 * max(high - low, 1e-3)  # all costs of a safe method are 0
         ax.set_ylim(low - margin, high + margin)
     ax.margins(x=0)
@@ -267,6 +268,9 @@ def parameter_evolution(
         ax.set_title(f"{symbol}, from {starts[0]:g}" if len(starts) == 1 else symbol)
     axes[0, 0].set_xlim(0, max(chosen["step"], default=1))
     axes[0, 0].set_yscale("symlog", linthresh=linear, linscale=0.5)
+    if largest:
+        ends = chosen["change"].agg(["min", "max"]).to_numpy()
+        axes[0, 0].set_ylim(1.8 * ends[0] - 0.3 * linear, 1.8 * ends[1] + 0.3 * linear)
     decades = [linear * 10**power for power in range(4) if linear * 10**power <= 1.5 * largest]
     used = [-d for d in decades[::-1] if chosen["change"].min() < -0.3 * d]
     used += [0.0, *(d for d in decades if chosen["change"].max() > 0.3 * d)]
@@ -319,7 +323,7 @@ def certificate_paths(
         row[0].set_title(group, loc="left")
         row[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     for ax in axes[-1]:
-        ax.set_xlabel("sum of learning rates")
+        ax.set_xlabel("sum of learning rates (linear to 0.1, then log)")
     return figure
 
 

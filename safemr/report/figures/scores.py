@@ -170,18 +170,21 @@ def aggregate_scores(
     *,
     method: str = paper.METHOD,
     name: str = "return",
+    meaning: str = "",
     absent: Sequence[str] = (),
     tasks: Sequence[str] = (),
 ) -> Figure:
     """Performance profiles over tasks, IQM of the normalised score, probability of improvement.
 
     aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn, but
-    named if it is among `absent`. `tasks` are named where they are not all of the grid's. Where a
-    task has too few runs for intervals, the figure says so.
+    named if it is among `absent`. ``meaning`` explains the ``name`` of the score. `tasks` are named
+    where they are not all of the grid's. Where a task has too few runs for intervals, the figure
+    says so.
     """
     figure = style.new_figure(style.TEXT_WIDTH, 2.4)
-    if tasks:
-        figure.suptitle(f"on {', '.join(tasks)} alone", fontsize=style.SMALL, color="0.4")
+    said = [meaning] * bool(meaning) + [f"on {', '.join(tasks)} alone"] * bool(tasks)
+    if said:
+        figure.suptitle("\n".join(said), fontsize=style.SMALL, color="0.4")
     left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
     draw_profiles(aggregates.profiles, left)
     if not aggregates.profiles:
@@ -189,7 +192,7 @@ def aggregate_scores(
     if absent:
         names = ", ".join(map(style.label, style.ordered(absent)))
         left.set_title(f"runs missing: {names}", fontsize=style.SMALL, color="0.4", style="italic")
-    left.set_xlabel(rf"score $\tau$: {name} / return that the paper prints for SafeMR")
+    left.set_xlabel(rf"score $\tau$: {name} / the paper's return of SafeMR")
     draw_intervals(aggregates.iqm, middle, neutral=1.0)
     middle.set_xlabel("interquartile mean of the score")
     runs = min((estimate.size for estimate in aggregates.iqm.values()), default=FEWEST_RUNS)
