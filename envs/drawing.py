@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +75,8 @@ def legend_of(scene: Scene) -> list[Artist]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    task, dot = scene.task, {"marker": "o", "ls": "none"}
+    task = scene.task
+    dot: dict[str, Any] = {"marker": "o", "ls": "none"}
     solid = task.solid_obstacles
     entries: list[Artist] = [
         Line2D([], [], color="black", marker="o", mfc=ROBOT_COLOR, mec=ROBOT_COLOR, ms=5, lw=1.0,

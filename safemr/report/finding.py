@@ -51,12 +51,11 @@ def ahead(flown: pd.DataFrame, found: pd.DataFrame, method: str = paper.METHOD) 
             text += f"in {dirty:.1f}% of them"
         elif len(others):
             rival = str(others.loc[others["return"].idxmax(), "variant"])
-            gap = statistics.difference_interval(
-                *(
-                    statistics.scores_of(flown, str(task), name, "eval_return")
-                    for name in (method, rival)
-                )
+            first, second = (
+                statistics.scores_of(flown, str(task), name, "eval_return")
+                for name in (method, rival)
             )
+            gap = statistics.difference_interval(first, second)
             interval = "" if pd.isna(gap.low) else rf" $\pm$ {gap.half_width:.1f}"
             text = f"{method} $-$ {rival}, the best other safe one: {gap.mean:+.1f}{interval}"
         rows.append((task, text))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -36,10 +37,12 @@ def draw_marks(points: pd.DataFrame, ax: Axes, *, dirty_share: float) -> Axes:
     ax.axvline(100 * dirty_share, color=SAFE, lw=0.8, ls=(0, (3, 2)), zorder=1)
     for _, row in points.iloc[::-1].iterrows():
         tint, _, mark = style.look(str(row["variant"]))
-        bars = {"color": tint, "lw": 1.0, "zorder": 2}
+        bars: dict[str, Any] = {"color": tint, "lw": 1.0, "zorder": 2}
         ax.plot([row["dirty"]] * 2, [row["return_low"], row["return_high"]], **bars)
         ax.plot([row["dirty_low"], row["dirty_high"]], [row["return"]] * 2, **bars)
-        fill = {"mec": "white", "mew": 0.6} if row["safe"] else {"mfc": "white", "mew": 1.3}
+        fill: dict[str, Any] = (
+            {"mec": "white", "mew": 0.6} if row["safe"] else {"mfc": "white", "mew": 1.3}
+        )
         ax.plot(row["dirty"], row["return"], marker=mark, color=tint, ms=6.5, zorder=3, **fill)
     right = max(float(np.nanmax(points[["dirty", "dirty_high"]])), 200 * dirty_share)
     ax.set_xlim(-0.06 * right, min(1.08 * right, 103.0))
@@ -77,7 +80,7 @@ def name_marks(points: pd.DataFrame, ax: Axes, *, bold: str = "") -> None:
         )[1]
         reach, side = [(r, s) for r in _REACHES for s in _SIDES][best]
         box = _placed(mark, size, side, reach * scale)
-        text.set_position(np.array([box.x0, box.y0]) / scale)
+        text.set_position((box.x0 / scale, box.y0 / scale))
         covered.append((box, 6.0))
         if reach > _REACHES[0]:
             near = np.clip(mark, [box.x0, box.y0], [box.x1, box.y1])
@@ -145,7 +148,7 @@ def finding(
         ax.remove()
     for ax in axes[:, 0]:
         ax.set_ylabel("return (per episode)")
-    look = {"color": "0.3", "marker": "o", "ls": "none", "ms": 5.5}
+    look: dict[str, Any] = {"color": "0.3", "marker": "o", "ls": "none", "ms": 5.5}
     limit = f"violations in at most {100 * (1 - clean_share):g}% of episodes"
     handles = [
         Patch(fc=SAFE, alpha=0.12, label=limit),

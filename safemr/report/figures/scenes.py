@@ -29,9 +29,16 @@ Phi = Callable[
     [Array, Array], Array
 ]  # energy of distances [m] and their rates [m/s], [..., M] each
 
-_PATH_OF_BOX = {"color": "#8a6a00", "lw": 0.8, "ls": (0, (2, 1))}
-_VIOLATION = {"ls": "none", "marker": "x", "ms": 4, "color": "k"}
-_REACHED = {"ls": "none", "marker": "o", "mfc": "none", "mec": "0.35", "ms": 4, "mew": 0.6}
+_PATH_OF_BOX: dict[str, Any] = {"color": "#8a6a00", "lw": 0.8, "ls": (0, (2, 1))}
+_VIOLATION: dict[str, Any] = {"ls": "none", "marker": "x", "ms": 4, "color": "k"}
+_REACHED: dict[str, Any] = {
+    "ls": "none",
+    "marker": "o",
+    "mfc": "none",
+    "mec": "0.35",
+    "ms": 4,
+    "mew": 0.6,
+}
 
 
 @style.styled

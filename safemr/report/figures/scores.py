@@ -126,7 +126,7 @@ def return_against_cost(
     for ax, task in zip(axes[0], tasks, strict=True):
         ax.set_title(task)
     handles = style.marks(style.ordered(wide["variant"].unique()))
-    look = {"color": "0.3", "marker": "o", "ls": "none", "ms": 6}
+    look: dict[str, Any] = {"color": "0.3", "marker": "o", "ls": "none", "ms": 6}
     handles.append(Line2D([], [], **look, label="mean, safe"))
     handles.append(Line2D([], [], **look, mfc="none", mew=1.1, label="mean, not safe"))
     handles.append(Line2D([], [], **{**look, "ms": 2.6}, label="one seed"))
