@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from envs.scene import Scene
 from envs.tasks import ROBOT_RADIUS
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 ROBOT_COLOR = "#d62728"
@@ -67,6 +68,31 @@ def draw_scene(
     ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), aspect="equal")
     ax.set(xlabel="x (m)", ylabel="y (m)")
     return ax
+
+
+def legend_of(scene: Scene) -> list[Artist]:
+    """Entries of a legend for what `draw_scene` draws of a scene."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    task = scene.task
+    dot: dict[str, Any] = {"marker": "o", "ls": "none"}
+    solid = task.solid_obstacles
+    entries: list[Artist] = [
+        Line2D([], [], color="black", marker="o", mfc=ROBOT_COLOR, mec=ROBOT_COLOR, ms=5, lw=1.0,
+               label="robot, heading"),
+        Line2D([], [], **dot, color=GOAL_COLOR, alpha=0.45, ms=8, label="goal"),
+        Line2D([], [], **dot, color=OBSTACLE_COLOR, alpha=1.0 if solid else 0.5, ms=6, mew=0,
+               label="pillar (solid)" if solid else "hazard (flat)"),
+    ]  # fmt: skip
+    if task.d_min > task.obstacle_size:
+        entries.append(
+            Line2D([], [], color=OBSTACLE_COLOR, ls=":", label=r"$d_{\min}$ of the robot's centre")
+        )
+    if scene.box is not None or scene.vase is not None:
+        name = "box" if scene.box is not None else "vase"
+        entries.append(Patch(fc=BOX_COLOR, ec="none", label=name))
+    return entries
 
 
 def _box_outlines(box: NDArray[np.float64]) -> list[NDArray[np.float64]]:

@@ -11,13 +11,17 @@ import pandas as pd
 import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from safemr import files, paper
+from safemr.certificates.point_robot import ROBOT
 from safemr.errors import UserError
 from safemr.experiment import config
 from safemr.paper import Zeta
-from safemr.report import sensitivity, statistics
-from safemr.report.figures import certificate, curves, scenes, scores, style
+from safemr.report import finding, sensitivity, statistics
+from safemr.report.figures import aircraft, certificate, curves, scenes, scores, style
+from safemr.report.figures import finding as finding_figure
+from safemr.report.tables import SafetyRule
 
 TASKS = ("Pillars-0.15-Goal", "Hazards-0.15-Push")
 D_MIN = 0.25
@@ -35,6 +39,7 @@ def progress() -> pd.DataFrame:
         for step in (100, 200, 300)
         for metric in ("eval_return", "eval_cost", "eval_cost_indicator", "sigma", "k", "n")
     ]
+    rows += [(*row[:4], "eval_zero_violation_share", 0.9) for row in rows[::6]]
     return pd.DataFrame(rows, columns=["task", "variant", "seed", "step", "metric", "value"])
 
 
@@ -47,9 +52,8 @@ def test_algorithms_have_distinct_colours_and_unknown_ones_a_stable_one():
     tints = np.array([luminance(style.colour(name)) for name in names])
     gaps = np.abs(tints[:, None] - tints[None]).sum(-1) + 3 * np.eye(len(names))
     assert gaps.min() > 0.3
-    looks = {(style.colour(name), str(style.line_style(name)), style.marker(name))
-             for name in names}  # fmt: skip
-    assert len(looks) == len(names)
+    for part in (style.line_style, style.marker):  # in grey, too
+        assert len({str(part(name)) for name in paper.ALGORITHMS}) == len(paper.ALGORITHMS)
     assert style.colour("my method") == style.colour("my method")
     assert style.colour("my method") not in {style.colour(name) for name in names}
 
@@ -90,6 +94,45 @@ def test_training_curves_draw_the_estimates(progress):
     assert len(figure.legends) == 1
     names = [text.get_text() for text in figure.legends[0].get_texts()]
     assert names == ["SafeMR", "JointSIS", "CPO", "mine"]
+    rows = [text.get_text() for text in figure.axes[2].get_yticklabels()]
+    assert rows == names, "of the costs"
+    whiskers = [line.get_segments() for line in ax.collections]
+    steps = [{x for (x, _), _ in segments} for segments in whiskers]
+    assert all(steps)
+    assert not set.intersection(*steps), "at different steps, or they lie upon each other"
+
+
+def test_curves_of_all_tasks_have_one_axis_of_steps(progress):
+    """One task's budgets differ tenfold, which makes the axis logarithmic for the other, too."""
+    late = progress[(progress["task"] == TASKS[0]) & (progress["variant"] == "CPO")]
+    longer = pd.concat([progress, late.assign(step=10 * late["step"])])
+    tables = [statistics.learning_curves(longer, m) for m in ("eval_return", "eval_cost")]
+    figure = curves.training_curves(*tables, TASKS)
+    assert {ax.get_xlim() for ax in figure.axes} == {(100.0, 3000.0)}
+    assert {ax.get_xscale() for ax in figure.axes} == {"log"}
+    assert {ax.get_xlabel() for ax in figure.axes[2:4]} == {"environment steps ($10^6$, log scale)"}
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [(2e4, 2e6, [3e4, 1e5, 3e5, 1e6]), (1, 1000, [1, 10, 100, 1000]), (100, 300, [100, 200]),
+     (6.0, 7.0, [6.0, 7.0])],
+)  # fmt: skip
+def test_logarithmic_axes_have_more_than_one_tick(low, high, ticks):
+    assert style.log_ticks(low, high) == pytest.approx(ticks)
+
+
+def test_small_changes_of_a_parameter_do_not_look_still(progress):
+    rows = [
+        (TASKS[0], variant, 0, step, "sigma", 0.3 - change * step)
+        for variant, change in (("SafeMR", 0.1), ("JointSIS", 0.001))
+        for step in (0, 1)
+    ]
+    table = pd.DataFrame(rows, columns=list(progress.columns))
+    ax = curves.parameter_evolution(table, TASKS[:1]).axes[0]
+    heights = ax.transAxes.inverted().transform(ax.transData.transform([(0, 0), (0, -0.001)]))
+    assert heights[0, 1] - heights[1, 1] > 0.1
+    assert [text.get_text() for text in ax.texts] == ["0.200", "0.299"]
 
 
 def test_wide_intervals_do_not_flatten_the_curves():
@@ -102,6 +145,16 @@ def test_wide_intervals_do_not_flatten_the_curves():
     low, high = ax.get_ylim()
     assert -7 < low <= 0
     assert 10 <= high < 17
+
+
+def test_a_peak_between_whiskers_is_in_the_view():
+    rows = [(name, step, 9.0 * (step == 1)) for name in ("a", "b") for step in range(4)]
+    table = pd.DataFrame(rows, columns=["variant", "step", "mean"])
+    ax = style.new_figure(3, 2).subplots()
+    curves.draw_curves(table.assign(low=table["mean"], high=table["mean"]), ax)
+    assert ax.get_ylim()[1] > 9.0
+    curves.cost_axis(ax, "cost")
+    assert ax.get_ylim()[1] > 9.0
 
 
 def variations(names: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -134,6 +187,12 @@ def test_a_legend_of_long_names_stays_inside_the_figure():
     extent = legend.get_window_extent()
     assert extent.x0 >= box.x0
     assert extent.x1 <= box.x1
+
+
+def found(progress: pd.DataFrame) -> Figure:
+    flown = statistics.final_scores(progress)
+    points = finding.points(flown, SafetyRule())
+    return finding_figure.finding(points, finding.ahead(flown, points), TASKS)
 
 
 def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
@@ -176,8 +235,9 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
         ),
         "weights": lambda: scores.weight_map(sensitivity.weight_map(final, learned, weights).data),
         "parameters": lambda: curves.parameter_evolution(
-            progress, TASKS, fixed={"FAC-phih": paper.PHI_H._asdict()}
+            progress, TASKS, variants=["SafeMR", "JointSIS"]
         ),
+        "finding": lambda: found(progress),
         "return against cost": lambda: scores.return_against_cost(final, TASKS, tolerance=1.0),
         "aggregates": lambda: scores.aggregate_scores(
             statistics.aggregate(final, ["SafeMR", "CPO"], "SafeMR", scale, np.linspace(0, 4, 9))
@@ -209,6 +269,8 @@ def test_figures_are_vector_and_pixels_at_print_width(progress, tmp_path, name):
     assert b"CreationDate" not in content
     width, _ = struct.unpack(">II", png.read_bytes()[16:24])
     assert width == pytest.approx(300 * figure.get_figwidth(), abs=1)
+    sizes = {text.get_fontsize() for text in figure.findobj(Text) if text.get_text()}
+    assert sizes <= {style.LETTERS, style.SMALL}
 
 
 def test_saving_twice_gives_equal_files(progress, tmp_path):
@@ -221,7 +283,7 @@ def test_saving_twice_gives_equal_files(progress, tmp_path):
 def test_an_unsafe_algorithm_has_a_hollow_mean(progress):
     final = statistics.final_scores(progress)
     final.loc[final["metric"] == "eval_cost_indicator", "value"] = 0.0
-    (ax, _) = scores.return_against_cost(final, TASKS, unsafe=[(TASKS[0], "CPO")]).axes
+    ax = scores.return_against_cost(final, TASKS, unsafe=[(TASKS[0], "CPO")]).axes[0]
     means = {line.get_color(): line for line in ax.lines if len(line.get_xdata()) == 1}
     assert means[style.colour("CPO")].get_markerfacecolor() == "none"
     assert means[style.colour("SafeMR")].get_markerfacecolor() == style.colour("SafeMR")
@@ -317,8 +379,9 @@ def test_the_view_holds_the_box_that_was_pushed_out_of_the_square():
     pushed["box"][:11, 0, 1] = 2.1
     pushed["box"][11:, 0, 1] = 2.9  # after the steps that are drawn
     figure = scenes.trajectories({"SafeMR": pushed}, draw_nothing, steps=10)
-    np.testing.assert_allclose(figure.axes[0].get_ylim(), (-2.0, 2.5), atol=1e-6)
-    np.testing.assert_allclose(figure.axes[1].get_ylim(), (-2.0, 2.0))
+    for ax in figure.axes[:2]:  # one view for all
+        np.testing.assert_allclose(ax.get_ylim(), (-2.0, 2.5), atol=1e-6)
+        np.testing.assert_allclose(np.diff(ax.get_xlim()), 4.5, atol=1e-6)
 
 
 def test_trajectories_state_the_return_and_draw_the_path(tmp_path):
@@ -341,6 +404,64 @@ def test_animation_is_a_small_looping_gif(tmp_path):
         assert image.n_frames == 6
         assert image.info["loop"] == 0
         assert image.info["duration"] == 80
+
+
+def test_the_zero_level_is_that_of_the_robots_velocity(monkeypatch):
+    """It moves along x at 0.05 m a step: phi = 0.55^2 - d^2 - d_dot is 0 at 0.55 m from the
+    obstacle abeam of it, and farther away before it."""
+    drawn = []
+    ax = style.new_figure(3, 3).subplots()
+    keep = type(ax).contour
+    monkeypatch.setattr(type(ax), "contour", lambda *a, **k: drawn.append(keep(*a, **k)))
+    view = np.array([[-2.0, 2.0], [-2.0, 2.0]])
+    phi = lambda d, d_dot: (0.55**2 - d**2 - d_dot).max(-1)  # noqa: E731
+    scenes._zero_level(ax, phi, recording(0.0), 0, 20, view)
+    (path,) = drawn[0].get_paths()
+    speed = 0.05 / ROBOT.step_s
+    x, y = path.vertices.T
+    d = np.hypot(x, y)
+    off = (0.55**2 - d**2 - x / d * speed)[d > 0.3]  # nearer than that the grid is coarse
+    np.testing.assert_allclose(off, 0.0, atol=0.01)
+    assert x.min() < -1.0
+
+
+def test_the_finding_names_all_and_says_how_far_the_method_is_ahead(progress):
+    flown = statistics.final_scores(progress)
+    clean = flown["metric"].isin(["eval_cost_indicator", "eval_zero_violation_share"])
+    value = (flown["metric"] == "eval_zero_violation_share").astype(float)
+    flown = flown.assign(value=flown["value"].where(~clean, value))
+    dirty = (flown["variant"] == "CPO") & (flown["metric"] == "eval_zero_violation_share")
+    flown = flown.assign(value=flown["value"].where(~dirty, 0.4))
+    points = finding.points(flown, SafetyRule())
+    ahead = finding.ahead(flown, points)
+    gap = statistics.difference_interval(
+        *(
+            statistics.scores_of(flown, TASKS[0], name, "eval_return")
+            for name in ("SafeMR", "JointSIS")
+        )
+    )
+    assert f"{gap.mean:+.1f} $\\pm$ {gap.half_width:.1f}" in ahead["text"].iloc[0]
+    ax = finding_figure.finding(points, ahead, TASKS).axes[0]
+    assert [text.get_text() for text in ax.texts] == ["SafeMR", "JointSIS", "CPO", "mine"]
+    boxes = [text.get_window_extent() for text in ax.texts]
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    hollow = {line.get_color() for line in ax.lines if line.get_markerfacecolor() == "white"}
+    assert hollow == {style.colour("CPO")}
+    (x,) = {line.get_xdata()[0] for line in ax.lines if line.get_markerfacecolor() == "white"}
+    assert x == pytest.approx(60.0)
+
+
+def test_what_some_seeds_call_unsafe_is_shaded_once(monkeypatch):
+    x = y = np.linspace(-8.0, 8.0, 33)
+    d = np.hypot(*np.meshgrid(x, y, indexing="ij"))
+    cut = aircraft.Slice(0.0, d - 3, 2 - d, {"SafeMR": [r - d for r in (4.0, 5.0, 7.0)]})
+    drawn = []
+    ax = style.new_figure(3, 3).subplots()
+    keep = type(ax).contour
+    monkeypatch.setattr(type(ax), "contour", lambda *a, **k: drawn.append(keep(*a, **k)))
+    aircraft.draw_slice(ax, x, y, cut, 2.0)
+    radii = np.hypot(*drawn[-1].get_paths()[0].vertices.T)
+    np.testing.assert_allclose(radii, 5.0, atol=0.05)
 
 
 def test_trajectories_from_elsewhere_are_refused(tmp_path):

@@ -94,6 +94,16 @@ def the_rollouts(again: Again) -> None:
     )
 
 
+def the_episodes(again: Again) -> None:
+    inputs = again.kept("episodes", f"{TASK}-SafeMR-seed*")[1]["inputs"]
+    trajectories.measured_episodes(
+        again.measurements,
+        Record.open(again.record(inputs["policy"])),
+        layouts=inputs["layouts"],
+        steps=inputs["steps"],
+    )
+
+
 def unseen_layouts(again: Again) -> None:
     inputs = again.kept("unseen_layouts", f"{TASK}-SafeMR-seed0")[1]["inputs"]
     evaluate.measured(
@@ -162,6 +172,7 @@ CASES: Mapping[Callable[[Again], None], tuple[Path, tuple[str, ...]]] = {
     a_learned_certificate: (RESULTS, ("certificates",)),
     the_margins: (RESULTS, ("margins",)),
     the_rollouts: (RESULTS, ("rollouts",)),
+    the_episodes: (RESULTS, ("episodes",)),
     unseen_layouts: (RESULTS, ("unseen_layouts",)),
     behind_filters: (RESULTS, ("filters",)),
     the_least_certificate: (RESULTS / "oracle", ("oracle", "encounters")),

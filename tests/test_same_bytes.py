@@ -61,7 +61,7 @@ def aircraft_slice() -> Figure:
     sets = [certificate.energy(np.hypot(*plane), 0.0, radius, 0.0, 0.0, 2.0) for radius in (2, 3)]
     learned = {"SafeMR": [sets[0]]}
     cut = aircraft.Slice(np.pi / 3, np.round(-sets[0], 3), sets[1], learned)
-    return aircraft.single(x, y, cut, 2.0)
+    return aircraft.slices(x, y, [cut], 2.0)
 
 
 def image(figure: Figure) -> bytes:

@@ -334,7 +334,7 @@ def test_curves_and_tables_have_the_parameters_by_name(family: EnergyFamily) -> 
     columns = ["task", "variant", "seed", "step", "metric", "value"]
     progress = pd.DataFrame(rows, columns=columns)
     figure = curves.parameter_evolution(progress, ["T"], variants=["Braking"], parameters=names)
-    assert [ax.get_ylabel() for ax in figure.axes] == [r"$\sigma$", "u", "t"]
+    assert [ax.get_title() for ax in figure.axes] == [r"$\sigma$", "u", "t"]
     table = sensitivity.table_two(
         progress[progress["step"] == 2], {"Braking": (0.35, 0.15)}, parameters=names
     )

@@ -37,6 +37,7 @@ VERSIONS = {
     "oracle": 1,
     "encounters": 1,
     "rollouts": 1,
+    "episodes": 1,
     "unseen_layouts": 1,
     "filters": 1,
     "aircraft_frontier": 1,

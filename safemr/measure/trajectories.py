@@ -18,10 +18,11 @@ from safemr.certificates.falsification import make_simulator
 from safemr.certificates.families import Parameters, phi_at
 from safemr.errors import UserError
 from safemr.experiment.planning import installed
+from safemr.experiment.record import Record
 from safemr.files import Arrays
 from safemr.learning.evaluation import Acts
 from safemr.measure.store import Measurements
-from safemr.measure.tracks import GEOMETRY
+from safemr.measure.tracks import GEOMETRY, below
 from safemr.tasks import Task, name_of
 
 if TYPE_CHECKING:
@@ -174,6 +175,21 @@ def measured(
         return {f"{part}/{name}": x for part, made in parts.items() for name, x in made.items()}
 
     return measurements.arrays("rollouts", record.label, inputs, measure)
+
+
+def measured_episodes(
+    measurements: Measurements, record: Record, *, layouts: list[int], steps: int
+) -> Arrays:
+    """`episodes` of any record's policy, kept among ``measurements``."""
+    inputs = {
+        "policy": record.inputs, "task": installed(record.task), "layouts": layouts, "steps": steps,
+    }  # fmt: skip
+
+    def measure() -> Arrays:
+        made = episodes(record.policy(), record.task, seeds=layouts, steps=steps)
+        return {f"episodes/{name}": values for name, values in made.items()}
+
+    return below(measurements.arrays("episodes", record.label, inputs, measure), "episodes/")
 
 
 def _pose(values: NDArray[Any] | None) -> NDArray[Any]:

@@ -97,6 +97,13 @@ class RateRule(SafetyRule):
         clean = statistics.scores_of(scores, task, variant, self.clean)
         return rate_interval(1 - clean, statistics.scores_of(scores, task, variant, EPISODES))
 
+    dirty = rate
+
+    @property
+    def marks(self) -> tuple[str, str]:
+        """What a filled and a hollow mark say where the limit is drawn."""
+        return "safe: the interval of their rate, too", "not safe, or not decided"
+
     def label(self, scores: pd.DataFrame, task: str, variant: str) -> Label | None:
         """Safe where the interval is at or below the limit, not safe where above, else open."""
         rate = self.rate(scores, task, variant)

@@ -68,7 +68,8 @@ class SafetyRule:
 
     def label(self, scores: pd.DataFrame, task: str, variant: str) -> Label | None:
         """What a table calls it, or None where there is no such run."""
-        return {True: "yes", False: "no", None: None}[self.is_safe(scores, task, variant)]  # type: ignore[return-value]
+        safe = self.is_safe(scores, task, variant)
+        return None if safe is None else "yes" if safe else "no"
 
     def is_safe(self, scores: pd.DataFrame, task: str, variant: str) -> bool | None:
         """True or False by the mean over seeds, or None where there is no such run."""
@@ -77,6 +78,17 @@ class SafetyRule:
         if not len(cost) or not len(clean):
             return None
         return bool(self.holds(cost.mean(), clean.mean()))
+
+    def dirty(self, scores: pd.DataFrame, task: str, variant: str) -> Estimate:
+        """Share of episodes with a violation, over the seeds, with its interval."""
+        clean = statistics.score_interval(scores, task, variant, self.clean)
+        return Estimate(1 - clean.mean, 1 - clean.high, 1 - clean.low, clean.size)
+
+    @property
+    def marks(self) -> tuple[str, str]:
+        """What a filled and a hollow mark say where the limit on those episodes is drawn."""
+        steps = f"{self.tolerance:g} violating step{'s' * (self.tolerance != 1)}"
+        return f"safe: that, and on average at most {steps}", "not safe"
 
     def holds(self, cost: pd.Series, clean: pd.Series) -> pd.Series:
         """Whether these violating steps an episode and shares of clean episodes are safe, each."""
@@ -205,11 +217,8 @@ def table_one(
     highest, difference, improvement = list(lines.values())[1:4]
     for column, r in enumerate(rows):
         if r["baseline_runs"] and not r["baseline"]:
-            highest[column], difference[column], improvement[column] = (
-                "none is safe",
-                ABSENT,
-                ABSENT,
-            )
+            highest[column], difference[column] = "none is safe", ABSENT
+            improvement[column] = ABSENT
         elif r["baseline"] and np.isnan(data["improvement"][column]):
             improvement[column] = "undefined (baseline ≤ 0)"
     display = pd.DataFrame(

@@ -9,7 +9,7 @@ AIRCRAFT_PLAN = [run for run in PLAN.aircraft if run not in NEURAL_PLAN]
 AIRCRAFT = [run for run in AIRCRAFT_PLAN if run.path in RECORDED_PATHS]
 NEURAL = [run for run in NEURAL_PLAN if run.path in RECORDED_PATHS]
 ENCOUNTER = dict(PLAN.aircraft[0].config["task"]) if PLAN.aircraft else paper.AIRCRAFT_TASK
-AIRCRAFT_FIGURES = ["aircraft_slices", "aircraft_airplane", "aircraft_frontier"]
+AIRCRAFT_FIGURES = ["aircraft_slices", "aircraft_frontier"]
 
 
 rule aircraft_frontier:
@@ -63,12 +63,7 @@ rule aircraft_figures:
         comparison=rules.aircraft_comparison.output.comparison,
         frontier=rules.aircraft_frontier.output[0],
     output:
-        pdf=expand(f"{FIGURES}/{{name}}.pdf", name=AIRCRAFT_FIGURES),
-        png=report(
-            expand(f"{FIGURES}/{{name}}.png", name=AIRCRAFT_FIGURES),
-            caption="../report/aircraft.rst",
-            category="Figures",
-        ),
+        **figure_outputs(*AIRCRAFT_FIGURES),
     log:
         f"{LOGS}/aircraft_figures.log",
     threads: 1
@@ -77,7 +72,6 @@ rule aircraft_figures:
         cache=f"{RESULTS}/.work/aircraft",
         task=ENCOUNTER,
         method=PLAN.encounter.first("method", paper.METHOD),
-        pair=PLAN.encounter.pair(),
         handcrafted=PLAN.encounter.of("handcrafted"),
         sources=sources("aircraft_figures"),
     script:

@@ -193,8 +193,71 @@ rule policies:
         "../scripts/policies.py"
 
 
+# The picture of the README, where the policies have flown unseen layouts.
+FLOWN_TASKS = [task for task in CONFIG.tasks if task in FLOWN]
+UNSEEN = dict(method=METHOD, **SAFE)
+
+
+rule finding:
+    input:
+        expand(rules.unseen_layouts.output[0], task=FLOWN_TASKS),
+    output:
+        **figure_outputs("finding"),
+    log:
+        f"{LOGS}/finding.log",
+    threads: 1
+    params:
+        **UNSEEN,
+        tasks=FLOWN_TASKS,
+        variants=GRID["variants"],
+        seeds=BUDGET["seeds"],
+        episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
+        sources=sources("finding"),
+    script:
+        "../scripts/finding.py"
+
+
+# The method beside an algorithm that violates, on the task whose certificates are pictured.
+BESIDE = {
+    run.variant: run
+    for run in reversed(PLAN.navigation)
+    if run.task == PICTURED and run.path in RECORDED_PATHS
+}
+
+
+rule side_by_side:
+    input:
+        record_files(BESIDE.values()),
+        flown=f"{SUMMARY}/unseen_layouts/{PICTURED}.csv",
+    output:
+        report(
+            f"{FIGURES}/side_by_side.gif",
+            caption="../report/side_by_side.rst",
+            category="Figures",
+        ),
+    log:
+        f"{LOGS}/side_by_side.log",
+    threads: 1
+    params:
+        **UNSEEN,
+        root=RESULTS,
+        folders={variant: run.path.as_posix() for variant, run in BESIDE.items()},
+        layouts=[CONFIG.unseen_layouts.seed + index for index in range(12)]
+        if CONFIG.unseen_layouts
+        else [],
+        steps=500,
+        lacking=without_policy(BESIDE.values()),
+        sources=sources("side_by_side"),
+    script:
+        "../scripts/side_by_side.py"
+
+
 TARGETS += [*rules.table_1.output, *rules.curves.output, *rules.final_scores.output]
 if ILLUSTRATIONS:
     TARGETS += [*rules.illustrations.output]
 if LEARNED and ROBOT_TASKS:
     TARGETS += [*rules.policies.output]
+if CONFIG.unseen_layouts and FLOWN_TASKS:
+    TARGETS += [*rules.finding.output]
+if CONFIG.unseen_layouts and METHOD in BESIDE and PICTURED in FLOWN:
+    TARGETS += [*rules.side_by_side.output]

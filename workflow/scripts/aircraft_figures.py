@@ -1,6 +1,5 @@
-"""Slices of the unsafe sets, one of them in the paper's style, and the runs on the frontier."""
+"""Slices of the unsafe sets, and the runs on the frontier."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -24,11 +23,8 @@ with reported_errors():
         handcrafted=params.handcrafted,
     )
 d_min = reachability.CONSTANT.d_min
-head_on = cuts[3]
-learned = {name: head_on.learned[name] for name in params.pair if name in head_on.learned}
 figures = (
     aircraft.slices(x, y, cuts, d_min),
-    aircraft.single(x, y, replace(head_on, learned=learned), d_min),
     aircraft.frontier(frontier, comparison, COVERS, params.handcrafted),
 )
 for figure, path in zip(figures, snakemake.output.pdf, strict=True):

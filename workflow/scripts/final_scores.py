@@ -21,6 +21,7 @@ figures = {
         final,
         params.tasks,
         tolerance=params.tolerance,
+        clean_share=params.clean_share,
         unsafe=[pair for pair in pairs if not rule.is_safe(final, *pair)],
     )
 }
@@ -30,9 +31,10 @@ if scale:  # the paper's return is the unit
     # To the next half beyond every run's score: a profile that ends earlier hides runs.
     low, high = np.floor(2 * normalised[0]) / 2, np.ceil(2 * normalised[1]) / 2
     thresholds = np.linspace(min(-0.5, low), max(2.0, high), 121)
-    for chosen, file, name in (
-        (final, "aggregate_scores", "return"),
-        (rule.safe_returns(final), "aggregate_safe_scores", "safe return"),
+    unsafe = "safe return: 0 where the run is not safe, or its task's lowest if that is negative"
+    for chosen, file, name, meaning in (
+        (final, "aggregate_scores", "return", ""),
+        (rule.safe_returns(final), "aggregate_safe_scores", "safe return", unsafe),
     ):
         aggregates = statistics.aggregate(chosen, params.variants, params.method, scale, thresholds)
         figures[file] = drawing.aggregate_scores(
@@ -40,6 +42,7 @@ if scale:  # the paper's return is the unit
             method=params.method,
             name=name,
             absent=[variant for variant in params.variants if variant not in aggregates.profiles],
+            meaning=meaning,
             tasks=() if len(scale) == len(params.tasks) else tuple(scale),
         )
 for path in map(Path, snakemake.output.pdf):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from envs.drawing import draw_scene
+from envs.drawing import draw_scene, legend_of
 from envs.scene import first_scene
 from envs.tasks import REGISTERED_TASKS
 from safemr import paper
@@ -21,7 +21,7 @@ layouts = {
 drawn = {
     "energy_and_safe_set": lambda: certificate.energy_and_safe_set(learned, d_min),
     "narrow_passage": lambda: certificate.narrow_passage(*pair, d_min),
-    "environments": lambda: scenes.environments(layouts, draw_scene),
+    "environments": lambda: scenes.environments(layouts, draw_scene, legend_of),
 }
 for path in map(Path, snakemake.output.pdf):
     style.save(drawn[path.stem](), path.with_suffix(""))

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from envs.drawing import draw_scene
+from envs.drawing import draw_scene, legend_of
 from safemr import files
 from safemr.measure import tracks
 from safemr.report.figures import certificate, scenes, style
@@ -32,7 +32,8 @@ figures = [
     )
 ]
 figures += [
-    scenes.trajectories(episodes[task], draw_scene, steps=params.steps) for task in params.tasks
+    scenes.trajectories(episodes[task], draw_scene, steps=params.steps, entries=legend_of)
+    for task in params.tasks
 ]
 for figure, path in zip(figures, output.pdf, strict=True):
     style.save(figure, Path(path).with_suffix(""))

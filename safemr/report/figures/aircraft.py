@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
-from matplotlib.ticker import FixedLocator, MultipleLocator, NullLocator
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from safemr.aircraft.slices import Slice
@@ -43,7 +43,10 @@ def draw_aircraft(
 
 
 def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
-    """Boundaries of all unsafe sets around the evader, which flies to the right."""
+    """Boundaries of all unsafe sets around the evader, which flies to the right.
+
+    Of a learner's runs the median boundary, and shaded what is unsafe by some of them only.
+    """
     ax.contourf(x, y, cut.truth.T, levels=[-np.inf, 0], colors=[TRUE], alpha=0.13)
     ax.add_patch(Circle((0, 0), d_min, fc="0.8", ec="0.35", lw=0.8, alpha=0.9, zorder=2))
     ax.contour(x, y, cut.truth.T, levels=[0], colors=[TRUE], linewidths=2.0, zorder=4)
@@ -54,9 +57,12 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     ax.contour(x, y, handcrafted.T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
                linewidths=1.2, linestyles=[(0, (1.5, 1))], zorder=5)  # fmt: skip
     for variant in reversed(style.ordered(cut.learned)):
-        for phi in cut.learned[variant]:
-            ax.contour(x, y, style.steady(phi).T, levels=[0], colors=[style.colour(variant)],
-                       linewidths=1.0, linestyles=[_dash(variant, cut)], zorder=6)  # fmt: skip
+        tint, runs = style.colour(variant), style.steady(np.stack(cut.learned[variant]))
+        disputed = np.minimum(runs.max(0), -runs.min(0))  # > 0: unsafe by some, but not by all
+        if disputed.max() > 0:
+            ax.contourf(x, y, disputed.T, levels=[0, np.inf], colors=[tint], alpha=0.35, zorder=5)
+        ax.contour(x, y, np.median(runs, axis=0).T, levels=[0], colors=[tint],
+                   linewidths=1.2, linestyles=[_dash(variant, cut)], zorder=6)  # fmt: skip
     draw_aircraft(ax, 0.0, 0.0, 0.0, "#0072B2")
     ax.set(aspect="equal", xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
     ax.xaxis.set_major_locator(MultipleLocator(5))
@@ -74,13 +80,16 @@ def _handles(cut: Slice) -> list[Line2D | Patch]:
     handles: list[Line2D | Patch] = [
         Patch(fc=(*_rgb(TRUE), 0.13), ec=TRUE, lw=2.0, label="true unsafe set"),
         *(
-            Line2D([], [], color=style.colour(v), ls=_dash(v, cut), lw=1.0, label=style.label(v))
+            Line2D([], [], color=style.colour(v), ls=_dash(v, cut), lw=1.2,
+                   label=style.label(v) + ", median" * (len(cut.learned[v]) > 1))
             for v in style.ordered(cut.learned)
         ),
         Line2D([], [], color=style.colour(_HANDCRAFTED), ls=(0, (1.5, 1)), lw=1.2,
                label=_HANDCRAFTED_LABEL),
         Patch(fc="0.8", ec="0.35", lw=0.8, label=r"collision, $d<d_{\min}$"),
     ]  # fmt: skip
+    if any(len(runs) > 1 for runs in cut.learned.values()):
+        handles.append(Patch(fc="0.5", alpha=0.35, label="shade: unsafe by some seeds only"))
     if cut.adversarial is not None:
         handles.append(Line2D([], [], color=TRUE, ls=(0, (4, 2)), lw=0.7,
                               label="true, adversarial traffic"))  # fmt: skip
@@ -112,24 +121,6 @@ def slices(x: Array, y: Array, cuts: Sequence[Slice], d_min: float) -> Figure:
     return figure
 
 
-@style.styled
-def single(x: Array, y: Array, cut: Slice, d_min: float) -> Figure:
-    """The paper's Fig. "airplane": one slice, both aircraft, the boundaries of the unsafe sets."""
-    figure = style.new_figure(style.COLUMN_WIDTH, 3.35)
-    ax = figure.subplots()
-    draw_slice(ax, x, y, cut, d_min)
-    place = (x[-1] - 2.6, y[-1] - 2.2)
-    draw_aircraft(ax, *place, cut.psi, TRUE)
-    for at, angle, tint in (((0.0, 0.0), 0.0, "#0072B2"), (place, cut.psi, TRUE)):
-        tip = style.steady([at[0] + 3.6 * np.cos(angle), at[1] + 3.6 * np.sin(angle)])
-        ax.annotate(
-            "", tuple(tip), at, arrowprops={"arrowstyle": "->", "color": tint, "lw": 0.9}, zorder=8
-        )
-    ax.set(xlabel="$x$ ahead of the evader (m)", ylabel="$y$ to its left (m)")
-    figure.legend(handles=_handles(cut), loc="outside lower center", ncols=2)
-    return figure
-
-
 def draw_frontier(
     ax: Axes,
     frontier: pd.DataFrame,
@@ -139,14 +130,15 @@ def draw_frontier(
 ) -> Axes:
     """Volume ratio against missed share [%], of the best members of the family and of the runs.
 
-    Of ``handcrafted`` variants the certificate is the fixed one, which is drawn once.
+    Of ``handcrafted`` variants the certificate is the fixed one, which is drawn once. Where the
+    runs lie close together they are shown once more, larger.
     """
-    ax.axvspan(0, 100 * covers, color="0.93", lw=0)
-    ax.axhline(1, color=TRUE, lw=1.0)
+    ax.axvspan(0, 100 * covers, color="#009E73", alpha=0.4, lw=0)
+    ax.axhline(1, color=TRUE, lw=1.0, ls=(0, (4, 2)))
     ax.fill_between(100 * frontier["missed_share"], 0, frontier["volume_ratio"], fc="none",
                     ec="0.82", hatch="////", lw=0)  # fmt: skip
     ax.plot(100 * frontier["missed_share"], frontier["volume_ratio"], color="k", lw=1.4)
-    ax.text(1.15, 0.62, r"out of reach of any $[\sigma,k,n]$",
+    ax.text(6.0, 0.62, r"out of reach of any $[\sigma,k,n]$",
             bbox={"fc": "white", "ec": "none", "pad": 1.0})  # fmt: skip
     looks = {"phi_h": (style.colour("FAC-phih"), "X"), "phi_0": (style.colour("FAC-phi0"), "P"),
              "code init": ("k", "1")}  # fmt: skip
@@ -156,20 +148,30 @@ def draw_frontier(
         ax.plot(100 * row["missed_share"], row["volume_ratio"], marker=marker, color=tint, ms=6,
                 mec="k" if marker == "1" else "white", mew=1.2 if marker == "1" else 0.5,
                 ls="none", clip_on=False, zorder=4)  # fmt: skip
-    for variant in style.ordered(_moving(comparison, handcrafted)):
-        run = comparison[comparison["variant"] == variant]
-        ax.plot(100 * run["missed_share"], run["volume_ratio"], marker=style.marker(variant),
-                color=style.colour(variant), ms=4.5, mec="white", mew=0.4, ls="none",
-                clip_on=False, zorder=5)  # fmt: skip
-    ax.set_xscale("symlog", linthresh=1.0, linscale=0.7)
-    ax.set_xlim(0, 100)
-    ax.xaxis.set_major_locator(FixedLocator([0, 0.5, 1, 2, 5, 10, 20, 50, 100]))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.xaxis.set_major_formatter("{x:g}")
+    runs = comparison[comparison["variant"].isin(_moving(comparison, handcrafted))]
+    _draw_runs(ax, runs)
+    ax.set_xlim(-2, 103)
+    ax.xaxis.set_major_locator(MultipleLocator(20))
     highest = float(pd.concat([comparison["volume_ratio"], frontier["volume_ratio"]]).max())
     ax.set_ylim(0.5, max(2.0, 1.08 * highest))
     ax.set(xlabel="share of the true set's shell that is missed (%)", ylabel="volume / true volume")
+    ends = runs[["missed_share", "volume_ratio"]].agg(["min", "max"]) * [100, 1]
+    if len(runs) > 1 and (ends.loc["max"] - ends.loc["min"] < [30, 0.5]).all():
+        near = ax.inset_axes((0.47, 0.54, 0.5, 0.44))
+        near.plot(100 * frontier["missed_share"], frontier["volume_ratio"], color="k", lw=1.4)
+        _draw_runs(near, runs)
+        margin = 0.12 * (ends.loc["max"] - ends.loc["min"]) + [0.5, 0.01]
+        low, high = ends.loc["min"] - margin, ends.loc["max"] + margin
+        near.set(xlim=(low.iloc[0], high.iloc[0]), ylim=(low.iloc[1], high.iloc[1]))
+        style.mark_zoom(ax, near)
     return ax
+
+
+def _draw_runs(ax: Axes, runs: pd.DataFrame) -> None:
+    for variant in style.ordered(runs["variant"].unique())[::-1]:
+        run, tint = runs[runs["variant"] == variant], style.colour(variant)
+        ax.plot(100 * run["missed_share"], run["volume_ratio"], marker=style.marker(variant),
+                ms=5, mfc=(*_rgb(tint), 0.35), mec=tint, mew=1.0, ls="none", zorder=5)  # fmt: skip
 
 
 def _moving(comparison: pd.DataFrame, handcrafted: Collection[str] = ()) -> list[str]:
@@ -186,14 +188,14 @@ def frontier(
     handcrafted: Collection[str] = (),
 ) -> Figure:
     """Where each run lies on the trade-off that the energy family allows."""
-    figure = style.new_figure(style.COLUMN_WIDTH, 3.0)
+    figure = style.new_figure(style.COLUMN_WIDTH, 3.3)
     draw_frontier(figure.subplots(), best, comparison, covers, handcrafted)
     handles: list[Line2D | Patch] = [
         Line2D([], [], color="k", lw=1.4, label=r"frontier over $[\sigma,k,n]$"),
-        Line2D([], [], color=TRUE, lw=1.0, label="true volume"),
+        Line2D([], [], color=TRUE, lw=1.0, ls=(0, (4, 2)), label="true volume"),
         *(
-            Line2D([], [], color=style.colour(v), marker=style.marker(v), ls="none", ms=4.5,
-                   label=style.label(v))
+            Line2D([], [], marker=style.marker(v), ls="none", ms=5, mew=1.0, mec=style.colour(v),
+                   mfc=(*_rgb(style.colour(v)), 0.35), label=f"{style.label(v)}, one run")
             for v in style.ordered(_moving(comparison, handcrafted))
         ),
         Line2D([], [], color=style.colour("FAC-phih"), marker="X", ls="none", ms=6, mec="white",
@@ -201,7 +203,7 @@ def frontier(
         Line2D([], [], color=style.colour("FAC-phi0"), marker="P", ls="none", ms=6, mec="white",
                mew=0.5, label=r"distance $\phi_0$"),
         Line2D([], [], color="k", marker="1", ls="none", ms=6, mew=1.2, label="learners' start"),
-        Patch(fc="0.93", label=f"covers ({100 * covers:g}% missed or less)"),
+        Patch(fc="#009E73", alpha=0.4, label=f"covers ({100 * covers:g}% missed or less)"),
     ]  # fmt: skip
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return figure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +22,10 @@ from safemr.report.figures import style
 
 Array = NDArray[np.float64]
 
-_PAPER = ("#000000", "#7A7A7A", "#B5B5B5")  # the paper's three sets
+# The paper's three sets: colour and line.
+_PAPER = (("#000000", "-"), ("#7A7A7A", (0, (4, 1.5))), ("#A5A5A5", (0, (1, 1.2))))
+# White to the method's orange, darker.
+_SHADES = ListedColormap(1 - np.linspace(0, 1, 256)[:, None] * (1 - np.array([0.78, 0.26, 0.0])))
 _HANDCRAFTED = {"phi_0": "FAC-phi0", "phi_h": "FAC-phih"}
 
 
@@ -162,54 +166,88 @@ def narrow_passage(
 
 
 def draw_requirement(zetas: Mapping[str, Zeta], d_min: float, ax: Axes) -> Axes:
-    """Required deceleration against closing speed, between what drag and aligned thrust give."""
+    """Required deceleration beyond drag against closing speed, and what thrust can add to drag.
+
+    Drag is subtracted because the certificates' lines would lie upon each other beside it.
+    """
     u = np.linspace(0, ROBOT.max_speed, 301)[1:]
-    ax.fill_between(u, ROBOT.deceleration(u, "drag only"), ROBOT.deceleration(u, "aligned brake"),
-                    color="0.92", lw=0)  # fmt: skip
-    for braking, place, where in (("aligned brake", 0.1, "bottom"), ("drag only", 1.0, "top")):
-        low, high = ROBOT.deceleration(np.array([place, place + 0.1]), braking)
-        ax.plot(u, ROBOT.deceleration(u, braking), color="k", lw=1.2)
-        ax.text(place, low, f"available: {braking}", va=where, rotation_mode="anchor",
-                rotation=np.degrees(np.arctan((high - low) / 0.1)),
-                transform_rotates_text=True)  # fmt: skip
+    drag = ROBOT.deceleration(u, "drag only")
+    brake = style.steady(ROBOT.deceleration(u, "aligned brake") - drag)
+    ax.fill_between(u, 0, brake, color="0.93", lw=0)
+    for level in (0.0 * brake, brake):
+        ax.plot(u, level, color="k", lw=1.4)
+    ax.text(0.03 * u[-1], brake[0] + 0.05, "available: drag and aligned brake", va="bottom",
+            fontsize=style.SMALL)  # fmt: skip
+    ax.text(0.97 * u[-1], -0.05, "available: drag only", va="top", ha="right",
+            fontsize=style.SMALL)  # fmt: skip
     papers = iter(_PAPER)
+    # Of the ones that are not the paper's many end close to each other: once more, larger.
+    near = ax.inset_axes((0.07, 0.42, 0.36, 0.38))
+    ends = []
     for given, zeta in zetas.items():
         name = _math(given)
         variant = _HANDCRAFTED.get(given, given.partition(" (")[0])
         paper = given.startswith("paper") and next(papers, None)
-        tint = paper or style.colour(variant)
+        tint, line = paper or (style.colour(variant), style.line_style(variant))
         if zeta.k > 0:
             inside, outside = (
-                style.steady(radial_requirement(zeta, d_min, u, where)) for where in CONVENTIONS
+                style.steady(radial_requirement(zeta, d_min, u, where) - drag)
+                for where in CONVENTIONS
             )
-            ax.plot(u, inside, color=tint, label=name)
-            ax.plot(u, outside, color=tint, ls="--", lw=0.8)
+            ax.plot(u, inside, color=tint, ls=line, label=name)
+            ax.fill_between(u, inside, outside, color=tint, alpha=0.25, lw=0)
+            near.plot(u, inside, color=tint, ls=line)
+            if not paper:
+                ends.append(inside)
         else:
             ax.plot([], [], ls="none", label=f"{name}: no finite value ($k=0$)")
-    ax.plot([], [], color="0.5", lw=0.8, ls="--", label=r"dashed: $C=\sigma+d_{\min}^n$")
-    ax.set(xlabel="closing speed $u$ (m/s)", ylabel="radial deceleration (m/s$^2$)")
-    rows = min((len(zetas) + 2) // 2, 10)  # of the legend above the lines
-    ax.set(xlim=(0, ROBOT.max_speed), ylim=(0, max(8.2, 5.9 / (1 - 0.07 * rows))))
-    ax.legend(loc="upper left", ncols=2, columnspacing=1.0)
+    ax.fill_between([], [], [], color="0.5", alpha=0.25, lw=0,
+                    label=r"up to $C=\sigma+d_{\min}^n$")  # fmt: skip
+    ax.set(xlabel="closing speed $u$ (m/s)", ylabel="radial deceleration\nbeyond drag (m/s$^2$)")
+    ax.set(xlim=(0, ROBOT.max_speed), ylim=(-0.5, 1.14 * brake.max()))
+    if len(ends) > 1:
+        part = np.array(ends)[:, u >= 0.9 * ROBOT.max_speed]
+        margin = 0.1 * (part.max() - part.min())
+        near.set(xlim=(0.9 * ROBOT.max_speed, ROBOT.max_speed), xticks=[], yticks=[])
+        near.set_ylim(part.min() - margin, part.max() + margin)
+        near.grid(False)
+        style.mark_zoom(ax, near)
+    else:
+        near.remove()
+    ax.legend(loc="upper center", bbox_to_anchor=(0.45, -0.22), ncols=2, columnspacing=1.0)
     return ax
 
 
-def draw_margin_map(margins: pd.DataFrame, ax: Axes) -> Axes:
-    """Best margin over distance and bearing (`certify.margin_map`); the zero level in black."""
+def draw_margin_map(margins: pd.DataFrame, ax: Axes, *, rest: float | None = None) -> Axes:
+    """Best margin over distance and bearing (`certify.margin_map`); the zero level in black.
+
+    rest: distance at which phi of a robot at rest is 0, which is where the worst of the few speeds
+    that are searched changes.
+    """
     table = margins.pivot(index="distance", columns="bearing", values="margin")
     bearing, distance = np.degrees(table.columns.to_numpy()), table.index.to_numpy()
     limit = max(float(np.nanmax(np.abs(table.to_numpy()))), 1e-6)
     image = ax.pcolormesh(bearing, distance, table, cmap="RdBu_r", vmin=-limit, vmax=limit,
                           rasterized=True)  # fmt: skip
+    handles: list[Line2D | Patch] = []
     if np.nanmax(table.to_numpy()) > 0:
         ax.contour(bearing, distance, table.fillna(-1), levels=[0.0], colors="k", linewidths=1)
+        handles.append(Line2D([], [], color="k", lw=1, label=r"$g=0$: red, no action is safe"))
+    if rest is not None and distance[0] < rest < distance[-1]:
+        ax.axhline(rest, color="0.2", lw=0.9, ls=(0, (4, 2)))
+        text = r"nearer, $\phi>0$ even at rest"
+        handles.append(Line2D([], [], color="0.2", lw=0.9, ls=(0, (4, 2)), label=text))
+    if table.isna().to_numpy().any():
+        handles.append(Patch(fc="0.75", label="the robot would overlap the obstacle"))
     ax.set_facecolor("0.75")
     ax.set(xlabel="bearing of the obstacle (deg)", ylabel="distance $d$ (m)")
     ax.set_xticks([0, 45, 90, 135, 180])
     ax.grid(False)
+    if handles:
+        ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.22))
     figure = ax.get_figure()
     assert figure is not None
-    figure.colorbar(image, ax=ax, pad=0.02, label="least $g$ of the worst motion")
+    figure.colorbar(image, ax=ax, pad=0.02, label="least $g$ of the worst motion (m$^n$)")
     return ax
 
 
@@ -221,10 +259,12 @@ def certificate_check(
 
     zetas: of the paper's family; other families have no such condition.
     """
-    figure = style.new_figure(style.TEXT_WIDTH, 2.7)
+    rows = (len(zetas) + 2) // 2
+    figure = style.new_figure(style.TEXT_WIDTH, 2.6 + 0.14 * max(rows, 3))
     left, right = figure.subplots(1, 2)
     draw_requirement(zetas, d_min, left)
-    draw_margin_map(margins, right)
+    mapping = zetas.get(mapped)
+    draw_margin_map(margins, right, rest=mapping and mapping.sigma + d_min)
     right.set_title(_math(mapped))
     for letter, ax in zip("ab", (left, right), strict=True):
         style.panel_letter(ax, letter)
@@ -234,11 +274,12 @@ def certificate_check(
 # --- what a trained policy's multiplier sees -----------------------------------------------------
 
 
-def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
-    """lambda(s) as shades, phi = 0 as a line; data: `trajectories.multiplier_map`."""
-    top = max(float(np.nanmax(data["multiplier"])), 1e-3)
-    shades = ListedColormap(1 - np.linspace(0, 1, 256)[:, None] * (1 - np.array([0.78, 0.26, 0.0])))
-    image = ax.pcolormesh(data["x"], data["y"], data["multiplier"], cmap=shades, vmin=0, vmax=top,
+def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes, *, top: float) -> Any:
+    """lambda(s) as shades up to ``top``, phi = 0 as a line; returns what the bar of shades needs.
+
+    data: `trajectories.multiplier_map`.
+    """
+    image = ax.pcolormesh(data["x"], data["y"], data["multiplier"], cmap=_SHADES, vmin=0, vmax=top,
                           rasterized=True)  # fmt: skip
     outside = np.where(np.isnan(data["multiplier"]), np.nan, data["phi"])
     ax.contour(data["x"], data["y"], outside, levels=[0.0], colors="#0072B2", linewidths=1.3)
@@ -257,28 +298,30 @@ def draw_multiplier_map(data: Mapping[str, NDArray], ax: Axes) -> Axes:
     tick = np.floor(extent) or extent
     ax.set(aspect="equal", xticks=[-tick, 0, tick], yticks=[-tick, 0, tick], xlabel="$x$ (m)")
     ax.grid(False)
-    figure = ax.get_figure()
-    assert figure is not None
-    figure.colorbar(image, ax=ax, location="bottom", pad=0.02, shrink=0.85, aspect=25,
-                    label=r"$\lambda(s)$")  # fmt: skip
-    return ax
+    return image
 
 
 @style.styled
 def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence[str]) -> Figure:
     """One panel a task: the multiplier of a trained policy and the zero level of its phi (blue).
 
-    The arrow is the direction of motion at every point; green: the goal; dotted: d_min.
+    All have one scale of shades. The arrow is the direction of motion at every point; green: the
+    goal; dotted: d_min.
     """
-    figure = style.new_figure(style.row_width(len(names)), 2.8)
+    figure = style.new_figure(style.row_width(len(names)), 2.5)
     axes = figure.subplots(1, len(names), squeeze=False)[0]
+    peaks = [float(np.nanmax(scene["multiplier"])) for scene in scenes.values()]
     for ax, name in zip(axes, names, strict=True):
         ax.set_title(name)
         if name in scenes:
-            draw_multiplier_map(scenes[name], ax)
+            image = draw_multiplier_map(scenes[name], ax, top=max(*peaks, 1e-3))
         else:
-            ax.text(0.5, 0.5, "no record", transform=ax.transAxes, ha="center", color="0.5")
+            style.note(ax, "no record")
             ax.set(box_aspect=1, xticks=[], yticks=[])
+    if scenes:
+        figure.colorbar(
+            image, ax=list(axes), pad=0.01, shrink=0.8, label=r"multiplier $\lambda(s)$"
+        )
     axes[0].set_ylabel("$y$ (m)")
     handles = {
         r"$\phi = 0$": Line2D([], [], color="#0072B2", lw=1.3),

@@ -62,7 +62,7 @@ def film(
     cursors = _history(data, energy, size, acts)
     scene = _scene(data, left, draw_scene) if draw_scene and "robot" in data else None
     move = scene or _plane(data, left, certificate)
-    figure.suptitle(title, fontsize="medium")
+    figure.suptitle(title, fontsize=style.LETTERS)
     writer = WRITERS[path.suffix](fps=max(1, round(1 / (stride * step_s))))
     with writer.saving(figure, path, DPI):
         for step in range(0, len(data["phi"]), stride):
@@ -127,7 +127,7 @@ def _history(data: Arrays, energy: Axes, size: Axes, acts: bool) -> list[Any]:
     if len(none):
         energy.plot(none, phi[none], ls="none", marker="x", ms=4, color="k", label="no safe action")
     energy.set_ylabel(r"energy $\phi$")
-    energy.legend(loc="lower right", fontsize="small")
+    energy.legend(loc="lower right", fontsize=style.SMALL)
     energy.tick_params(labelbottom=False)
     size.fill_between(steps, 0, data["distance"], step="post", color=INTERVENED, lw=0)
     size.set(xlabel="step", ylabel="change", ylim=(0, max(1.0, 1.1 * data["distance"].max())))

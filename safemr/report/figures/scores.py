@@ -11,48 +11,72 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from numpy.typing import ArrayLike, NDArray
 
 from safemr import paper
 from safemr.report.figures import style
 from safemr.report.statistics import FEWEST_RUNS, Aggregates, Estimate
+
+_NONE = 0.3  # width of the strip of runs without a violation, in widths of the axis beside it
 
 
 def draw_return_against_cost(
     points: pd.DataFrame,
     ax: Axes,
     *,
+    low: float,
+    high: float,
     tolerance: float | None = None,
     unsafe: Collection[str] = (),
+    logarithmic: bool = True,
 ) -> Axes:
     """One small marker a seed, the mean over seeds large, and hollow if `unsafe`.
 
-    points: variant, seed, cost, return. Costs of 0 are spread left of 0, the variants that have
-    any side by side, or most would lie upon each other.
+    points: variant, seed, cost, return. The axis of costs begins at ``low`` > 0 and ends at
+    ``high``; runs without any cost stand in a strip of their own beside it, the variants side by
+    side, as most would lie upon each other. Costs up to ``tolerance`` are shaded.
     """
-    if tolerance is not None:
-        ax.axvspan(-1, tolerance, color="#009E73", alpha=0.08, lw=0, zorder=0)
+
+    def along(cost: ArrayLike) -> NDArray[np.float64]:
+        value = np.asarray(cost, float)
+        if logarithmic:
+            return style.steady(np.log(np.maximum(value, low) / low) / np.log(high / low))
+        return value / high
+
     variants = style.ordered(points["variant"].unique())
     clean = style.ordered(points.loc[points["cost"] == 0, "variant"].unique())
-    sides = {variant: 0.5 * ((i + 0.5) / len(clean) - 1) for i, variant in enumerate(clean)}
+    sides = {name: _NONE * ((i + 0.5) / len(clean) - 1) for i, name in enumerate(clean)}
+    if tolerance is not None:
+        end = float(along(tolerance)) if tolerance > 0 else 0.0
+        ax.axvspan(-_NONE, end, color="#009E73", alpha=0.08, lw=0, zorder=0)
+    ax.axvline(0, color="0.3", lw=0.8)
     for order, variant in enumerate(reversed(variants)):  # the first of the legend on top
         run = points[points["variant"] == variant]
-        tint = style.colour(variant)
+        tint, side = style.colour(variant), sides.get(variant, 0.0)
         look: dict[str, Any] = {"color": tint, "marker": style.marker(variant), "ls": "none"}
-        side = sides.get(variant, 0.0)
-        middle = run["cost"].mean()
         fill = {"mfc": "none", "mec": tint, "mew": 1.1} if variant in unsafe else {"mec": "white"}
-        ax.plot(middle + side * (middle == 0), run["return"].mean(), ms=6, zorder=2 + order / 100,
+        cost = np.array([run["cost"].mean(), *run["cost"]])
+        place = np.where(cost > 0, along(cost), side)
+        ax.plot(place[0], run["return"].mean(), ms=6, zorder=2 + order / 100,
                 **{"mew": 0.6, **look, **fill})  # fmt: skip
-        shifted = run["cost"] + side * (run["cost"] == 0)
-        ax.plot(shifted, run["return"], ms=2.6, alpha=0.75, zorder=3 + order / 100,
+        ax.plot(place[1:], run["return"], ms=2.6, alpha=0.75, zorder=3 + order / 100,
                 **{"mec": "white", "mew": 0.25, **look})  # fmt: skip
-    ax.set_xscale("symlog", linthresh=1.0, linscale=0.8)
-    right = max(1.6 * points["cost"].max(), 10.0) if len(points) else 10.0
-    ax.set_xlim(-0.55, right)
-    ax.set_xticks([tick for tick in (0, 1, 10, 100, 1000) if tick <= right])
-    ax.set_xticks([], minor=True)
-    ax.xaxis.set_major_formatter("{x:g}")
+    ticks = style.log_ticks(low, high) if logarithmic else _fifths(high)
+    ax.set_xlim(-_NONE, 1.03)
+    ax.set_xticks([-_NONE / 2, *along(ticks)], ["none", *(f"{tick:g}" for tick in ticks)])
     return ax
+
+
+def _fifths(high: float) -> list[float]:
+    """Three round numbers up to ``high``, from 0 on."""
+    step = next((s for s in (1, 2, 5, 10, 20, 25, 50) if 2 * s <= high < 4 * s), high / 2)
+    return [float(tick) for tick in np.arange(1, 4) * step if tick <= high]
+
+
+_RULE = {  # of the safety rule: what a panel shows, and with a logarithmic scale or a linear one
+    "eval_cost_indicator": ("violating steps an episode (log scale)", 1.0, True),
+    "eval_zero_violation_share": ("episodes with a violation (%)", 100.0, False),
+}
 
 
 @style.styled
@@ -60,44 +84,64 @@ def return_against_cost(
     scores: pd.DataFrame,
     tasks: Sequence[str],
     *,
-    cost: str = "eval_cost_indicator",
-    cost_name: str = "violating steps an episode",
     tolerance: float | None = None,
+    clean_share: float | None = None,
     unsafe: Collection[tuple[str, str]] = (),
 ) -> Figure:
-    """Return against cost of the final policies, one panel a task.
+    """Return against both costs of the safety rule, one column a task.
 
-    Costs up to `tolerance` are shaded; `unsafe` (task, variant) have hollow means.
+    Above violating steps, up to ``tolerance`` shaded; below the share of episodes with a violation,
+    shaded where at least ``clean_share`` have none. `unsafe` (task, variant) have hollow means.
+    Scores without that share have no such row.
     """
-    wide = scores[scores["metric"].isin(["eval_return", cost])].pivot_table(
+    metrics = [name for name in _RULE if (scores["metric"] == name).any()]
+    wide = scores[scores["metric"].isin(["eval_return", *_RULE])].pivot_table(
         index=["task", "variant", "seed"], columns="metric", values="value"
     )
-    wide = wide.rename(columns={"eval_return": "return", cost: "cost"}).reset_index()
-    figure = style.new_figure(style.text_width(len(tasks)), 2.1)
-    axes = figure.subplots(1, len(tasks), squeeze=False)[0]
-    for ax, task in zip(axes, tasks, strict=True):
-        hollow = [variant for where, variant in unsafe if where == task]
-        chosen = wide[wide["task"] == task]
-        draw_return_against_cost(chosen, ax, tolerance=tolerance, unsafe=hollow)
-        if not (wide["task"] == task).any():
-            _say(ax, "no record")
+    wide = wide.rename(columns={"eval_return": "return"}).reset_index()
+    rows = max(len(metrics), 1)
+    figure = style.new_figure(style.text_width(len(tasks)), 0.4 + 1.75 * rows)
+    axes = figure.subplots(rows, len(tasks), squeeze=False, sharey="col")
+    for row, metric in zip(axes, metrics or list(_RULE)[:1], strict=True):
+        name, unit, logarithmic = _RULE[metric]
+        cost = wide[metric] if metric in wide else pd.Series(dtype=float)
+        cost = unit * (1 - cost) if "share" in metric else cost
+        cost = cost.round(9)
+        limit = tolerance if logarithmic else clean_share and unit * (1 - clean_share)
+        low = min([*cost[cost > 0], limit or 1.0]) / 1.5
+        high = 1.2 * max([*cost, limit or 1.0, 2 * low])
+        for ax, task in zip(row, tasks, strict=True):
+            chosen = wide.assign(cost=cost)[wide["task"] == task]
+            hollow = [variant for where, variant in unsafe if where == task]
+            draw_return_against_cost(chosen, ax, low=low, high=high, tolerance=limit,
+                                     unsafe=hollow, logarithmic=logarithmic)  # fmt: skip
+            if chosen.empty:
+                style.note(ax, "no record")
+        row[len(tasks) // 2].set_xlabel(name)
+        if len(tasks) % 2 == 0:
+            row[len(tasks) // 2].xaxis.set_label_coords(-0.1, -0.16)
+        row[0].set_ylabel(
+            "final return (per episode)" if rows == 1 else "final return\n(per episode)"
+        )
+    for ax, task in zip(axes[0], tasks, strict=True):
         ax.set_title(task)
-        ax.set_xlabel(cost_name)
-    axes[0].set_ylabel("final return")
-    variants = style.ordered(wide["variant"].unique())
-    handles = style.marks(variants)
-    columns = style.legend_columns(variants)
+    handles = style.marks(style.ordered(wide["variant"].unique()))
+    look: dict[str, Any] = {"color": "0.3", "marker": "o", "ls": "none", "ms": 6}
+    handles.append(Line2D([], [], **look, label="mean, safe"))
+    handles.append(Line2D([], [], **look, mfc="none", mew=1.1, label="mean, not safe"))
+    handles.append(Line2D([], [], **{**look, "ms": 2.6}, label="one seed"))
+    columns = style.legend_columns([str(handle.get_label()) for handle in handles])
     figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     return figure
 
 
 def draw_profiles(profiles: Mapping[str, pd.DataFrame], ax: Axes) -> Axes:
     """Share of runs above a normalised score; profiles: variant -> threshold, mean, low, high."""
-    for variant in style.ordered(profiles):
-        profile, tint = profiles[variant], style.colour(variant)
-        ax.plot(profile["threshold"], profile["mean"], color=tint, ls=style.line_style(variant))
-        ax.fill_between(profile["threshold"], profile["low"], profile["high"],
-                        color=tint, alpha=0.12, lw=0)  # fmt: skip
+    for place, variant in enumerate(style.ordered(profiles)):
+        profile = profiles[variant].rename(columns={"threshold": "x"})
+        # Whiskers every few thresholds, not at each.
+        of = 3 * len(profiles)
+        style.interval_line(ax, profile, style.look(variant), place=3 * place, of=of)
     ax.set_ylim(-0.02, 1.02)
     ax.margins(x=0)
     ax.set_ylabel(r"share of runs with score $> \tau$")
@@ -126,41 +170,43 @@ def aggregate_scores(
     *,
     method: str = paper.METHOD,
     name: str = "return",
+    meaning: str = "",
     absent: Sequence[str] = (),
     tasks: Sequence[str] = (),
 ) -> Figure:
     """Performance profiles over tasks, IQM of the normalised score, probability of improvement.
 
     aggregates: `statistics.aggregate`; a variant that lacks a task is not in it and not drawn, but
-    named if it is among `absent`. `tasks` are named where they are not all of the grid's. Where a
-    task has too few runs for intervals, the figure says so.
+    named if it is among `absent`. ``meaning`` explains the ``name`` of the score. `tasks` are named
+    where they are not all of the grid's. Where a task has too few runs for intervals, the figure
+    says so.
     """
-    figure = style.new_figure(style.TEXT_WIDTH, 2.3)
-    if tasks:
-        figure.suptitle(f"on {', '.join(tasks)} alone", fontsize="small", color="0.4")
+    figure = style.new_figure(style.TEXT_WIDTH, 2.4)
+    said = [meaning] * bool(meaning) + [f"on {', '.join(tasks)} alone"] * bool(tasks)
+    if said:
+        figure.suptitle("\n".join(said), fontsize=style.SMALL, color="0.4")
     left, middle, right = figure.subplots(1, 3, width_ratios=[1.5, 1, 1])
     draw_profiles(aggregates.profiles, left)
     if not aggregates.profiles:
-        _say(left, "no algorithm has runs on every task")
+        style.note(left, "no algorithm has runs on every task")
     if absent:
         names = ", ".join(map(style.label, style.ordered(absent)))
-        left.set_title(f"runs missing: {names}", fontsize="small", color="0.4", style="italic")
-    left.set_xlabel(rf"normalised {name} $\tau$ (paper's SafeMR: 1)")
+        left.set_title(f"runs missing: {names}", fontsize=style.SMALL, color="0.4", style="italic")
+    left.set_xlabel(rf"score $\tau$: {name} / the paper's return of SafeMR")
     draw_intervals(aggregates.iqm, middle, neutral=1.0)
-    middle.set_xlabel(f"IQM of normalised {name}")
+    middle.set_xlabel("interquartile mean of the score")
     runs = min((estimate.size for estimate in aggregates.iqm.values()), default=FEWEST_RUNS)
     if runs < FEWEST_RUNS:
         few = f"{runs} run{'s' * (runs > 1)} a task: no intervals"
         for ax in (middle, right):
-            ax.set_title(few, fontsize="small", color="0.4", style="italic")
+            ax.set_title(few, fontsize=style.SMALL, color="0.4", style="italic")
     draw_intervals(aggregates.improvement, right, neutral=0.5)
     right.set_xlim(-0.03, 1.03)
     right.set_xlabel(rf"$P$({style.label(method)} $>$ baseline)")
     for letter, ax in zip("abc", (left, middle, right), strict=True):
         style.panel_letter(ax, letter)
     handles = [
-        Line2D([], [], color=style.colour(v), ls=style.line_style(v), label=style.label(v))
-        for v in style.ordered(aggregates.profiles)
+        style.line_entry(style.look(v), style.label(v)) for v in style.ordered(aggregates.profiles)
     ]
     if handles:
         columns = style.legend_columns(aggregates.profiles)
@@ -189,7 +235,7 @@ def draw_grid(data: pd.DataFrame, column: str, ax: Axes, *, number: str = "{:.2f
     for (row, place), value in np.ndenumerate(values):
         text = number.format(value) if np.isfinite(value) else missing
         dark = not np.isfinite(value) or value > low + 0.6 * (high - low)
-        ax.text(place, row, text, ha="center", va="center", fontsize="small",
+        ax.text(place, row, text, ha="center", va="center", fontsize=style.SMALL,
                 color="k" if dark else "w")  # fmt: skip
     ax.set_xticks(range(len(table.columns)), [f"{a:g}" for a in table.columns])
     ax.set_yticks(range(len(table.index)), [f"{b:g}" for b in table.index])
@@ -229,7 +275,3 @@ def weight_map(data: pd.DataFrame, parameters: Sequence[str] = tuple(_PAPERS)) -
     for ax in axes[:, 0]:
         ax.set_ylabel("$b$, weight of $k$" if papers else "$b$")
     return figure
-
-
-def _say(ax: Axes, text: str) -> None:
-    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", color="0.5", style="italic")

@@ -1,4 +1,4 @@
-"""One style for every figure: widths, fonts, and one colour and line style per algorithm."""
+"""One style for every figure: widths, letters, and the look of every algorithm."""
 
 from __future__ import annotations
 
@@ -9,25 +9,30 @@ from typing import Any, cast
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import ArrayLike, NDArray
 
 COLUMN_WIDTH = 3.5  # inches, one column of the paper
 TEXT_WIDTH = 7.16  # inches, both columns
 
+LETTERS, SMALL = 8, 7  # points: titles and names of axes; numbers, legends and notes. No other.
+
 RC: dict[str, Any] = {
     "font.family": "STIXGeneral",  # Times-like, shipped with matplotlib: the same on every machine
     "mathtext.fontset": "stix",
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.labelsize": 8,
-    "xtick.labelsize": 7,
-    "ytick.labelsize": 7,
-    "legend.fontsize": 7,
+    "font.size": LETTERS,
+    "axes.titlesize": LETTERS,
+    "axes.labelsize": LETTERS,
+    "figure.titlesize": LETTERS,
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+    "legend.fontsize": SMALL,
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -42,25 +47,32 @@ RC: dict[str, Any] = {
     "lines.linewidth": 1.2,
     "lines.solid_capstyle": "round",
     "legend.frameon": False,
-    "legend.handlelength": 1.8,
+    "legend.handlelength": 2.4,
     "hatch.linewidth": 0.4,
     "figure.dpi": 150,
     "pdf.fonttype": 42,  # text stays text
     "figure.constrained_layout.use": True,
 }
 
-# Okabe-Ito colours: distinct under the common colour-vision deficiencies. The line style tells the
-# families apart in grey: certificate learners solid, CMDP baselines dashed, fixed energies dotted.
+# Okabe-Ito colours: distinct under the common colour-vision deficiencies. In grey the markers and
+# lines tell algorithms apart: certificate learners have long lines, CMDP baselines dashes, fixed
+# energies dots.
 _SOLID, _DASHED, _DOTTED = "-", (0, (4, 1.5)), (0, (1, 1.2))
 _DASH_DOTTED = (0, (4, 1.2, 1, 1.2))
+_LONG, _SHORT, _DASH_DASHED, _SPARSE = (
+    (0, (9, 1.5)),
+    (0, (2, 1)),
+    (0, (6, 1.2, 2, 1.2)),
+    (0, (1, 2.4)),
+)
 _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, marker, mathtext
     "SafeMR": ("#D55E00", _SOLID, "o", "SafeMR"),
-    "JointSIS": ("#0072B2", _SOLID, "s", "JointSIS"),
+    "JointSIS": ("#0072B2", _LONG, "s", "JointSIS"),
     "PPO-L": ("#009E73", _DASHED, "^", "PPO-L"),
-    "TRPO-L": ("#56B4E9", _DASHED, "v", "TRPO-L"),
-    "CPO": ("#CC79A7", _DASHED, "D", "CPO"),
+    "TRPO-L": ("#56B4E9", _SHORT, "v", "TRPO-L"),
+    "CPO": ("#CC79A7", _DASH_DASHED, "D", "CPO"),
     "FAC-phi0": ("#555555", _DOTTED, "P", r"FAC-$\phi_0$"),
-    "FAC-phih": ("#E69F00", _DOTTED, "X", r"FAC-$\phi_h$"),
+    "FAC-phih": ("#E69F00", _SPARSE, "X", r"FAC-$\phi_h$"),
     "SAC-L": ("#000000", _DASHED, "*", "SAC-L"),
     # config/oracle.yaml
     "FAC-oracle": ("#882255", _DOTTED, "p", "FAC-oracle"),
@@ -75,6 +87,8 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
 }
 # Tol's "muted" colours for variants that nobody planned.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")
+
+Look = tuple[str, Any, str]  # colour, line style, marker
 
 UNSAFE = "#C44E52"  # true or actual violation
 INK = "0.25"
@@ -95,11 +109,17 @@ def line_style(variant: str) -> Any:
     return known[1] if known else _DASH_DOTTED
 
 
-def member_look(index: int) -> tuple[str, Any]:
-    """Colour and line of the members of a group that is drawn alone: the first solid and dark."""
+def look(variant: str) -> Look:
+    """Colour, line and marker of a variant."""
+    return colour(variant), line_style(variant), marker(variant)
+
+
+def member_look(index: int) -> Look:
+    """Look of the members of a group that is drawn alone: the first solid and dark."""
     if index == 0:
-        return ("#000000", _SOLID)
-    return (_OTHERS[(index - 1) % len(_OTHERS)], (_DASHED, _DOTTED, _SOLID)[(index - 1) % 3])
+        return "#000000", _SOLID, "o"
+    line = (_DASHED, _DOTTED, _SOLID)[(index - 1) % 3]
+    return _OTHERS[(index - 1) % len(_OTHERS)], line, "s^vDPX"[(index - 1) % 6]
 
 
 def marker(variant: str) -> str:
@@ -165,13 +185,70 @@ def steady(values: ArrayLike) -> NDArray[np.float64]:
     return np.round(np.asarray(values, np.float64) * 2.0**20) / 2.0**20
 
 
-def thousands(ax: Axes) -> None:
-    """Label the x axis in thousands or millions of environment steps."""
-    million = ax.get_xlim()[1] >= 2e6
-    unit, name = (1e6, r"$10^6$") if million else (1e3, r"$10^3$")
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / unit:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.set_xlabel(f"environment steps ({name})")
+def interval_line(
+    ax: Axes, table: pd.DataFrame, look: Look, *, place: int, of: int
+) -> pd.DataFrame:
+    """A mean as a line and markers; at some of them, others for each of ``of`` lines, its interval.
+
+    table: x, mean, low, high. Shaded bands of many lines lie upon each other; whiskers at every
+    ``of``-th point, counted from the last, with an offset of ``place``, do not. Returns those rows.
+    """
+    tint, line, mark = look
+    shown = list(range(len(table)))[::-1][min(place, max(len(table) - 1, 0)) :: of]
+    chosen = table.iloc[shown]
+    ax.plot(table["x"], table["mean"], color=tint, ls=line, lw=1.1, marker=mark, markevery=shown,
+            ms=3.8, mec="white", mew=0.4, zorder=3)  # fmt: skip
+    ax.vlines(chosen["x"], chosen["low"], chosen["high"], color=tint, lw=0.8, alpha=0.7, zorder=3.5)
+    return chosen
+
+
+def line_entry(look: Look, text: str) -> Line2D:
+    """The entry of a legend for `interval_line`."""
+    tint, line, mark = look
+    return Line2D([], [], color=tint, ls=line, lw=1.1, marker=mark, ms=3.8, mec="white", mew=0.4,
+                  label=text)  # fmt: skip
+
+
+def mark_zoom(ax: Axes, near: Axes) -> None:
+    """A frame around what ``near``, an inset of ``ax``, shows larger."""
+    near.spines[:].set(visible=True, color="0.4")
+    (left, right), (low, high) = near.get_xlim(), near.get_ylim()
+    ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, ec="0.4", lw=0.6,
+                           zorder=6))  # fmt: skip
+
+
+def note(ax: Axes, text: str) -> None:
+    """Grey words in an empty panel."""
+    ax.text(0.5, 0.5, text, transform=ax.transAxes, ha="center", color="0.4", style="italic",
+            fontsize=SMALL)  # fmt: skip
+
+
+def steps_axis(ax: Axes, *, logarithmic: bool = False) -> None:
+    """The x axis in millions of environment steps; a logarithmic one says so and has two ticks."""
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1e6:g}"))
+    scale = ""
+    if logarithmic:
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(FixedLocator(log_ticks(*ax.get_xlim())))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1e6:g}"))
+        ax.xaxis.set_minor_locator(NullLocator())
+        scale = ", log scale"
+    ax.set_xlabel(f"environment steps ($10^6${scale})")
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Round numbers within [low, high] for a logarithmic axis: three or more where there are.
+
+    Powers of ten, or 1 and 3, or 1, 2 and 5 times those; beside a single one both ends.
+    """
+    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    inside: list[float] = []
+    for steps, enough in (((1,), 3), ((1, 3), 3), ((1, 2, 5), 2)):
+        ticks = sorted({float(step * power) for step in steps for power in powers})
+        inside = [tick for tick in ticks if 0.999 * low <= tick <= 1.001 * high]
+        if len(inside) >= enough:
+            return inside
+    return sorted({low, *inside, high})
 
 
 def panel_letter(ax: Axes, letter: str) -> None:
