@@ -179,7 +179,8 @@ def test_a_recording_shorter_than_the_animation_ends_it(tmp_path: Path) -> None:
     track = np.zeros((9, 1, 3), np.float32)
     recorded = {
         "robot": track, "goal": track[..., :2], "box": np.full_like(track, np.nan),
-        "obstacles": np.zeros((1, 8, 2)), "goal_met": np.zeros((8, 1)),
+        "obstacles": np.zeros((1, 8, 2)),
+        "goal_met": np.zeros((8, 1)), "cost_indicator": np.zeros((8, 1)),
         **{name: np.array(0.2) for name in ("obstacle_size", "d_min", "goal_size")},
         "extent": np.array(1.5), "solid_obstacles": np.array(False),
     }  # fmt: skip
