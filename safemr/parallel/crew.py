@@ -1,0 +1,152 @@
+"""Processes that the driver asks and waits for. The one module that knows Ray, which is an extra.
+
+Where they run, ``RAY_ADDRESS`` says: the address of a running cluster, or, without it, this machine
+alone. It is no hyperparameter, since it changes no number that a run could be repeated with.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from safemr.errors import UserError
+
+ADDRESS = "RAY_ADDRESS"
+STORE_BYTES = 200_000_000  # between processes; what does not fit goes through the disk
+ANSWER_S = 60.0  # within which a process that lives says so, where it is not busy
+
+
+class LostError(Exception):
+    """A task will never be done: its process, or the host that held its result, is gone."""
+
+
+class Crew(Protocol):
+    """Workers, objects whose methods are asked for. One does what it is asked in that order."""
+
+    def hire(self, worker: type[Any], *args: Any) -> Any:
+        """A new worker, made of a class and its arguments."""
+
+    def ask(self, worker: Any, method: str, *args: Any) -> Any:
+        """A promise of what the method returns; promises among the arguments are fulfilled first
+        and need not pass through this process."""
+
+    def put(self, value: Any) -> Any:
+        """A promise that is fulfilled by ``value``."""
+
+    def first(self, promises: Sequence[Any]) -> Any:
+        """One of these that is fulfilled or broken, when there is one."""
+
+    def get(self, promise: Any) -> Any:
+        """What was promised. Raises LostError."""
+
+    def lives(self, worker: Any) -> bool: ...
+
+    def dismiss(self, worker: Any) -> None: ...
+
+    def notes(self) -> dict[str, Any]:
+        """What a record's provenance says of the processes."""
+
+    def close(self) -> None: ...
+
+
+class RayCrew:
+    """Workers as actors of Ray, one CPU of Ray's each.
+
+    Raises UserError where Ray is not installed, the cluster is not there, or it is too small.
+    """
+
+    def __init__(self, workers: int) -> None:
+        try:
+            import ray
+        except ImportError as error:
+            raise UserError(
+                'the parallel trainer needs Ray: pip install ".[ray]" in a clone of this '
+                "repository, or train by the algorithm of one process"
+            ) from error
+        self._ray = ray
+        self._own = not ray.is_initialized()
+        if self._own:
+            self._start(workers)
+        held = int(ray.cluster_resources().get("CPU", 0))
+        if held < workers:
+            self.close()
+            raise UserError(
+                f"the cluster of Ray has {held} CPUs, and samplers + buffers + learners are "
+                f"{workers}: start it with more (ray start --num-cpus), or ask for fewer"
+            )
+        errors = ray.exceptions
+        self._lost = (
+            errors.RayActorError,
+            errors.WorkerCrashedError,
+            errors.ObjectLostError,
+            errors.NodeDiedError,
+            errors.LocalRayletDiedError,
+        )
+
+    def _start(self, workers: int) -> None:
+        address = os.environ.get(ADDRESS)
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        own = {} if address else {"num_cpus": workers, "object_store_memory": STORE_BYTES}
+        # It takes SIGTERM for itself, which the training program answers with a checkpoint.
+        main = threading.current_thread() is threading.main_thread()
+        handler = signal.getsignal(signal.SIGTERM)
+        try:
+            self._ray.init(
+                address=address or "local",
+                include_dashboard=None if address else False,
+                log_to_driver=False,
+                logging_level="ERROR",
+                **own,
+            )
+        except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
+            reason = str(error).strip().partition("\n")[0]
+            where = f"{ADDRESS} = {address}" if address else "Ray does not start here"
+            raise UserError(f"{where}: {reason}") from error
+        finally:
+            if main:
+                signal.signal(signal.SIGTERM, handler)
+
+    def hire(self, worker: type[Any], *args: Any) -> Any:
+        # Restarting is the trainer's: Ray would do it without the state.
+        actor = self._ray.remote(num_cpus=1, max_restarts=0, scheduling_strategy="SPREAD")(worker)
+        return actor.remote(*args)
+
+    def ask(self, worker: Any, method: str, *args: Any) -> Any:
+        return getattr(worker, method).remote(*args)
+
+    def put(self, value: Any) -> Any:
+        return self._ray.put(value)
+
+    def first(self, promises: Sequence[Any]) -> Any:
+        (done, *_), _ = self._ray.wait(list(promises), num_returns=1)
+        return done
+
+    def get(self, promise: Any) -> Any:
+        try:
+            return self._ray.get(promise)
+        except self._lost as error:
+            lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+            raise LostError(lines[-1] if lines else type(error).__name__) from error
+
+    def lives(self, worker: Any) -> bool:
+        try:
+            self._ray.get(worker.present.remote(), timeout=ANSWER_S)
+        except self._ray.exceptions.GetTimeoutError:
+            return True  # it is busy
+        except self._lost:
+            return False
+        return True
+
+    def dismiss(self, worker: Any) -> None:
+        self._ray.kill(worker)
+
+    def notes(self) -> dict[str, Any]:
+        nodes = sum(1 for node in self._ray.nodes() if node["Alive"])
+        return {"ray": self._ray.__version__, "ray_nodes": nodes}
+
+    def close(self) -> None:
+        if self._own:
+            self._ray.shutdown()
