@@ -18,7 +18,7 @@ import torch
 from toy import ToyEnvs
 
 from safemr.errors import UserError
-from safemr.experiment import checkpoints
+from safemr.experiment import checkpoints, resources
 from safemr.experiment.catalogue import hyperparameters, load_algorithm
 from safemr.learning import losses
 from safemr.learning.acting import Acting
@@ -490,6 +490,18 @@ def test_they_are_their_algorithms_with_five_hyperparameters_more(module: str) -
     assert ours == theirs | {name: ours[name] for name in more}
     for said in ("role", "learns", "certificate", "family"):
         assert getattr(parallel, said) == getattr(alone, said)
+
+
+def test_a_run_asks_for_cores_and_memory_by_its_processes() -> None:
+    def asked(name: str, **values: Any) -> tuple[int, int]:
+        resolved = hyperparameters(load_algorithm(name), values, "--set")
+        config = {"algorithm": {"hyperparameters": resolved}}
+        return resources.cores(config), resources.memory_mb(config)
+
+    assert asked("safemr") == asked("ppo_lagrangian") == (1, 1500)
+    small, large = (asked(MODULES[0], samplers=n, buffers=n, learners=n) for n in (2, 4))
+    assert (small[0], large[0]) == (7, 13)
+    assert large[1] - small[1] == 2 * sum(resources.EACH.values())
 
 
 def test_only_the_crew_imports_ray_and_only_when_it_is_asked() -> None:

@@ -16,6 +16,7 @@ from safemr.errors import UserError
 
 ADDRESS = "RAY_ADDRESS"
 STORE_BYTES = 200_000_000  # between processes; what does not fit goes through the disk
+STARTS = 3  # tries to start Ray here, which gives up after 30 s where others use the machine
 ANSWER_S = 60.0  # within which a process that lives says so, where it is not busy
 
 
@@ -89,24 +90,25 @@ class RayCrew:
     def _start(self, workers: int) -> None:
         address = os.environ.get(ADDRESS)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        own = {} if address else {"num_cpus": workers, "object_store_memory": STORE_BYTES}
+        where: dict[str, Any] = {"address": address}
+        if not address:
+            sizes = {"num_cpus": workers, "object_store_memory": STORE_BYTES}
+            where = {"address": "local", "include_dashboard": False, **sizes}
         # It takes SIGTERM for itself, which the training program answers with a checkpoint.
-        main = threading.current_thread() is threading.main_thread()
         handler = signal.getsignal(signal.SIGTERM)
         try:
-            self._ray.init(
-                address=address or "local",
-                include_dashboard=None if address else False,
-                log_to_driver=False,
-                logging_level="ERROR",
-                **own,
-            )
-        except (ConnectionError, TimeoutError, ValueError, RuntimeError) as error:
-            reason = str(error).strip().partition("\n")[0]
-            where = f"{ADDRESS} = {address}" if address else "Ray does not start here"
-            raise UserError(f"{where}: {reason}") from error
+            for attempt in range(1, STARTS + 1):
+                try:
+                    self._ray.init(log_to_driver=False, logging_level="CRITICAL", **where)
+                    return
+                except Exception as error:  # of no common class; a late node's is a bare one
+                    self._ray.shutdown()
+                    if address or attempt == STARTS:
+                        reason = str(error).strip().partition("\n")[0]
+                        said = f"{ADDRESS} = {address}" if address else "Ray does not start here"
+                        raise UserError(f"{said}: {reason}") from error
         finally:
-            if main:
+            if threading.current_thread() is threading.main_thread():
                 signal.signal(signal.SIGTERM, handler)
 
     def hire(self, worker: type[Any], *args: Any) -> Any:
