@@ -41,7 +41,7 @@ class Crew(Protocol):
         """One of these that is fulfilled or broken, when there is one."""
 
     def get(self, promise: Any) -> Any:
-        """What was promised. Raises LostError."""
+        """What was promised. Raises LostError, and UserError where its worker cannot be made."""
 
     def lives(self, worker: Any) -> bool: ...
 
@@ -123,7 +123,8 @@ class RayCrew:
         return self._ray.put(value)
 
     def first(self, promises: Sequence[Any]) -> Any:
-        (done, *_), _ = self._ray.wait(list(promises), num_returns=1)
+        # What one worker gives to another stays where it is.
+        (done, *_), _ = self._ray.wait(list(promises), num_returns=1, fetch_local=False)
         return done
 
     def get(self, promise: Any) -> Any:
@@ -131,7 +132,12 @@ class RayCrew:
             return self._ray.get(promise)
         except self._lost as error:
             lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-            raise LostError(lines[-1] if lines else type(error).__name__) from error
+            reason = lines[-1] if lines else type(error).__name__
+            if getattr(error, "actor_init_failed", False):  # and would fail again
+                raise UserError(
+                    f"a process of the parallel trainer fails at once: {reason}"
+                ) from error
+            raise LostError(reason) from error
 
     def lives(self, worker: Any) -> bool:
         try:

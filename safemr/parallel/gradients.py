@@ -24,15 +24,15 @@ from safemr.learning.soft_actor_critic import SoftActorCritic
 
 Arrays = dict[str, NDArray[np.float32]]
 NETWORKS = ("critics", "targets", "policy", "multiplier")
-CERTIFICATE = "zeta"
+ZETA_NAME = "zeta"  # a certificate's parameters, which no optimiser of Adam moves
 
 
 def weights(agent: SoftActorCritic, *names: str) -> Arrays:
     """Copies of some of an agent's tensors, or of all that a gradient depends on."""
     found = {name: getattr(agent, name).parameters for name in NETWORKS}
     found["temperature"] = agent.log_temperature
-    if hasattr(agent, CERTIFICATE):
-        found[CERTIFICATE] = getattr(agent, CERTIFICATE)
+    if hasattr(agent, ZETA_NAME):
+        found[ZETA_NAME] = getattr(agent, ZETA_NAME)
     return {name: found[name].detach().numpy().copy() for name in names or found}
 
 
@@ -43,7 +43,7 @@ def take_over(agent: SoftActorCritic, values: Mapping[str, NDArray[np.float32]])
             new = torch.from_numpy(np.array(value))  # what comes from another process is read-only
             if name in NETWORKS:
                 getattr(agent, name).load(new)
-            elif name == CERTIFICATE:
+            elif name == ZETA_NAME:
                 getattr(agent, name).copy_(new)
             else:
                 agent.log_temperature.copy_(new)
@@ -85,7 +85,7 @@ class Learning:
         found = {name: self._gradient(name) for name in names}
         if (certificate := agent.certificate_gradient(batch)) is not None:
             gradient, said = certificate
-            found[CERTIFICATE], info = gradient.numpy(), info | said
+            found[ZETA_NAME], info = gradient.numpy(), info | said
         if not measure:
             return found, {}
         info["violating_share"] = (target[-1] > 0).float().mean()
@@ -103,7 +103,7 @@ def step(agent: SoftActorCritic, gradients: Mapping[str, NDArray[np.float32]]) -
     agent.updates += 1
     for name, values in gradients.items():
         gradient = torch.from_numpy(np.array(values))
-        if name == CERTIFICATE:
+        if name == ZETA_NAME:
             agent.move_certificate(gradient)
             continue
         optimiser = agent.optimisers[name]

@@ -42,7 +42,7 @@ from safemr.parallel.gradients import step, weights
 from safemr.parallel.ledger import Earnings, Flights, Numbers
 from safemr.parallel.workers import BUFFER, DRIVER, LEARNER, SAMPLER, seed_of
 
-MOST_LOST = 20  # tasks in a row, after which whatever is wrong will not go away
+MOST_LOST = 10  # tasks in a row, after which whatever is wrong will not go away
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,7 @@ class Task(NamedTuple):
     version: int = 0  # of the policy that acts
     decisions: int = 0
     most_steps: int = 0  # control steps that these take at most
+    acted: bool = False  # whether they are made, and on their way to the buffer
 
 
 class Means:
@@ -155,6 +156,7 @@ class Trainer:
         self._episodes: list[Any] = []
         self._make_crew = crew
         self._crew: Crew | None = None
+        self._closed = False
         self._of_crew: dict[str, Any] = {}  # what its `notes` said
         self._resumed: Mapping[str, Any] | None = None
 
@@ -168,6 +170,8 @@ class Trainer:
         """The crew, hired at first use, with what a checkpoint says of it."""
         if self._crew is not None:
             return self._crew
+        if self._closed:
+            raise ValueError("this trainer was closed, and what its buffers held is gone")
         config, resumed = self.config, self._resumed
         crew = self._crew = self._make_crew(config.samplers + config.buffers + config.learners)
         self._of_crew = crew.notes()
@@ -179,7 +183,8 @@ class Trainer:
         self._landing: dict[int, workers.Gradients] = {}
         self._sent: tuple[int, Any] | None = None  # version of the weights sent last, and these
         self._lost_in_a_row, self._means, self._lost = 0, Means(), 0
-        self._random = np.random.default_rng(seed_of(self._seed, DRIVER, 0, self._lives[0][0]))
+        life = max(self._lives[SAMPLER])  # at least the number of resumptions
+        self._random = np.random.default_rng(seed_of(self._seed, DRIVER, 0, life))
         if resumed is None:
             return crew
         try:
@@ -220,7 +225,8 @@ class Trainer:
         return self._workers[BUFFER][sampler % self.config.buffers]
 
     def close(self) -> None:
-        """Ends the workers; `advance` would hire new ones."""
+        """Ends the workers, and with them the training."""
+        self._closed = True
         if self._crew is None:
             return
         for each in (worker for kind in self._workers for worker in kind):
@@ -274,11 +280,10 @@ class Trainer:
         stride = environments * self.interface.action_repeat
         each = min(config.chunk, -(-room // stride))
         policy = weights(self.agent, "policy")
-        done = crew.ask(self._workers[SAMPLER][index], "collect", policy, each)
-        stored = crew.ask(self._buffer(index), "store", index, done)
+        promise = crew.ask(self._workers[SAMPLER][index], "collect", policy, each)
         version = self._flights.version
         task = Task(SAMPLER, index, 0, version, each * environments, each * stride)
-        self._waiting[stored] = task
+        self._waiting[promise] = task
 
     def _ask_learner(self, crew: Crew, index: int) -> None:
         version = self._flights.version
@@ -297,6 +302,11 @@ class Trainer:
 
     def _receive(self, crew: Crew, promise: Any) -> None:
         task = self._waiting.pop(promise)
+        if task.kind == SAMPLER and not task.acted:
+            # Only now: a buffer does what it is asked in turn, and would let draws wait for it.
+            stored = crew.ask(self._buffer(task.worker), "store", task.worker, promise)
+            self._waiting[stored] = task._replace(acted=True)
+            return
         try:
             answer = crew.get(promise)
         except LostError as error:
