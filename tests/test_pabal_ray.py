@@ -122,6 +122,12 @@ def until_line(process: subprocess.Popen[str], pattern: str) -> str:
     raise AssertionError(f"ended with {process.wait()} before a line like {pattern}")
 
 
+def step_in(line: str) -> int:
+    found = re.search(r"at step (\d+)", line)
+    assert found is not None
+    return int(found[1])
+
+
 def ended(pid: int, seconds: float) -> bool:
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -139,9 +145,9 @@ def test_the_same_command_continues_and_records(tmp_path: Path) -> None:
     first.send_signal(signal.SIGTERM)
     said = until_line(first, "stopped by SIGTERM")
     assert first.wait(120) == 128 + signal.SIGTERM
-    step = int(re.search(r"at step (\d+)", said)[1])  # type: ignore[index]
+    step = step_in(said)
     second = command(tmp_path)
-    assert f"continues at step {step}" in until_line(second, "continues")
+    assert step_in(until_line(second, "continues")) == step
     until_line(second, "/9600 ")
     listed = subprocess.run(["ps", "-eo", "pid,ppid,args"], capture_output=True, text=True)
     raylets = [line.split()[0] for line in listed.stdout.splitlines()
@@ -150,8 +156,8 @@ def test_the_same_command_continues_and_records(tmp_path: Path) -> None:
     second.wait()
     assert raylets
     assert all(ended(int(pid), 60) for pid in raylets)
-    third = command(tmp_path)
-    assert f"continues at step {step}" in until_line(third, "continues")
+    third = command(tmp_path)  # the second may have had the time for a checkpoint
+    assert step_in(until_line(third, "continues")) >= step
     until_line(third, "record in")
     assert third.wait(120) == 0
     (folder,) = tmp_path.glob("runs/*/*/*")
