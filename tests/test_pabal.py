@@ -10,6 +10,7 @@ import dataclasses
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -527,3 +528,15 @@ def test_without_ray_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"needs Ray: pip install \"\.\[ray\]\""):
         RayCrew(1)
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
+def test_no_cluster_at_the_address_is_one_line(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Said at once; Ray would wait for it for minutes."""
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(is_initialized=lambda: False))
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(UserError, match=f"RAY_ADDRESS = {address}: no cluster") as caught:
+        RayCrew(1)
+    assert "\n" not in str(caught.value)

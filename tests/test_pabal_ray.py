@@ -97,13 +97,6 @@ def test_two_nodes_and_a_cluster_that_is_too_small(monkeypatch: pytest.MonkeyPat
         cluster.shutdown()
 
 
-def test_no_cluster_at_the_address_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    with pytest.raises(UserError, match=r"RAY_ADDRESS = 127\.0\.0\.1:1: ") as caught:
-        trainer_of().advance(800)
-    assert "\n" not in str(caught.value)
-
-
 def command(root: Path) -> subprocess.Popen[str]:
     small = SMALL | {"samplers": 1, "learners": 1}
     settings = [word for name, value in small.items() for word in ("--set", f"{name}={value}")]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -17,6 +18,7 @@ from safemr.errors import UserError
 ADDRESS = "RAY_ADDRESS"
 STORE_BYTES = 200_000_000  # between processes; what does not fit goes through the disk
 STARTS = 3  # tries to start Ray here, which gives up after 30 s where others use the machine
+KNOCK_S = 10.0  # within which a cluster answers
 ANSWER_S = 60.0  # within which a process that lives says so, where it is not busy
 
 
@@ -51,6 +53,20 @@ class Crew(Protocol):
         """What a record's provenance says of the processes."""
 
     def close(self) -> None: ...
+
+
+def _knock(address: str) -> None:
+    """Raises UserError where nobody answers at HOST:PORT, which Ray would wait for for minutes."""
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    if not port.isdecimal():
+        return  # another form than that
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), KNOCK_S).close()
+    except OSError as error:
+        raise UserError(
+            f"{ADDRESS} = {address}: no cluster of Ray answers there ({error}); start one there "
+            "(ray start --head), or unset the variable to use this machine alone"
+        ) from error
 
 
 class RayCrew:
@@ -91,7 +107,9 @@ class RayCrew:
         address = os.environ.get(ADDRESS)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         where: dict[str, Any] = {"address": address}
-        if not address:
+        if address:
+            _knock(address)
+        else:
             sizes = {"num_cpus": workers, "object_store_memory": STORE_BYTES}
             where = {"address": "local", "include_dashboard": False, **sizes}
         # It takes SIGTERM for itself, which the training program answers with a checkpoint.
