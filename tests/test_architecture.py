@@ -75,7 +75,8 @@ def test_direction_of_imports(path: Path) -> None:
 ROOMS = (
     *("errors", "files", "names", "conventions", "packages", "paper"),
     *("environments", "foreign_check", "foreign", "tasks"),
-    *("certificates", "learning", "filters", "algorithms", "experiment", "measure", "aircraft"),
+    *("certificates", "learning", "filters", "algorithms", "parallel"),
+    *("experiment", "measure", "aircraft"),
     "report",
     "cli",
 )

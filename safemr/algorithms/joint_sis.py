@@ -7,7 +7,7 @@ parameters zeta = [sigma, k, n].
 | equation of the paper | function |
 |---|---|
 | Lagrangian's dependence on zeta (SL2) | `certificate_loss` |
-| projection of zeta to a box | `Agent.update_certificate` |
+| projection of zeta to a box | `Agent.move_certificate` |
 
 Deviations. The same constraint function max(g, constraint_floor) as in critic and multiplier also
 enters here (``certificate_constraint = "floored"``), since all three belong to one Lagrangian; the
@@ -142,22 +142,33 @@ class Agent(fac.Agent):
 
     def update_certificate(self, batch: Batch) -> Info:
         """A projected gradient step on zeta every m_phi updates (Algorithm 1, last line)."""
-        if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
+        found = self.certificate_gradient(batch)
+        if found is None:
             return {}
+        gradient, info = found
+        self.move_certificate(gradient)
+        return info
+
+    def certificate_gradient(self, batch: Batch) -> tuple[Tensor, Info] | None:
+        """That of `certificate_loss` in zeta, with what is logged of it."""
+        if self.updates <= self._first_update or self.updates % self.config.certificate_delay:
+            return None
         with torch.no_grad():
             multipliers = self.multipliers(batch.observations)
         zeta = self.zeta.clone().requires_grad_(True)
         loss = self.certificate_loss(batch, zeta, multipliers)
         (gradient,) = torch.autograd.grad(loss, [zeta])
-        left = (self.total_updates - self.updates) / (self.total_updates - self._first_update)
-        moved = self.zeta.clone().sub_(gradient, alpha=self._rate * max(left, 0.0))
-        self.zeta.copy_(self.admitted(torch.clamp(moved, self._low, self._high)))
         names = self.config.energy_family.names
-        return {
+        return gradient, {
             "certificate_loss": loss.detach(),
             "certificate_grad_norm": gradient.norm(),
             **{f"certificate_grad_{name}": g for name, g in zip(names, gradient, strict=True)},
         }
+
+    def move_certificate(self, gradient: Tensor) -> None:
+        left = (self.total_updates - self.updates) / (self.total_updates - self._first_update)
+        moved = self.zeta.clone().sub_(gradient, alpha=self._rate * max(left, 0.0))
+        self.zeta.copy_(self.admitted(torch.clamp(moved, self._low, self._high)))
 
 
 class Trainer(fac.Trainer):

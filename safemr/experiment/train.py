@@ -9,6 +9,7 @@ the algorithm, this file evaluates, records, checkpoints and resumes; the algori
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 import time
@@ -114,7 +115,8 @@ def train(
         tell(f"{label} continues at step {trainer.step}", stream)
     family = families.named(described["hyperparameters"].get("family", families.PAPER.name))
     progress = Progress(label, steps, stream or sys.stderr, family.names)
-    with WandbLog(config, session, wandb or {}) as wandb_log:
+    ending = contextlib.closing(trainer) if hasattr(trainer, "close") else contextlib.nullcontext()
+    with ending, WandbLog(config, session, wandb or {}) as wandb_log:
         while trainer.step < steps:
             begun, before = time.perf_counter(), trainer.step
             metrics = trainer.advance(min((before // log_every + 1) * log_every, steps))
@@ -134,7 +136,9 @@ def train(
             progress.show(row)
             wandb_log.log(row)
             session.maybe_checkpoint(trainer.state_dict)
-    notes: dict[str, Any] = {} if exact_resume(evaluation_envs) else {"exact_resume": False}
+    notes: dict[str, Any] = dict(getattr(trainer, "notes", {}))
+    if not exact_resume(evaluation_envs):
+        notes["exact_resume"] = False
     if is_foreign(config["task"]):
         notes["task_package"] = distribution_of(config["task"]["id"].partition(":")[0])
     session.finish(trainer.policy.arrays(), notes)

@@ -293,7 +293,7 @@ class SoftActorCritic(ABC):
         targets = self.critic_targets(drawn)
         info: Info = {}
         for batch, target in zip(drawn.split(parts), targets.chunk(parts, 1), strict=True):
-            self._set_learning_rates()
+            self.set_learning_rates()
             self.updates += 1
             info |= backend.update_critics(batch, target, measure)
             if self.updates % config.policy_delay == 0:
@@ -310,7 +310,19 @@ class SoftActorCritic(ABC):
         """Where an algorithm moves its certificate, if it learns one. Returns metrics."""
         return {}
 
-    def _set_learning_rates(self) -> None:
+    def certificate_gradient(self, batch: Batch) -> tuple[Tensor, Info] | None:
+        """What a step of the certificate is taken on, with its metrics; None where no step is due.
+
+        `move_certificate` takes it, here or in another process (`safemr.parallel`).
+        """
+        return None
+
+    def move_certificate(self, gradient: Tensor) -> None:
+        """The certificate's step on a `certificate_gradient`."""
+        raise NotImplementedError
+
+    def set_learning_rates(self) -> None:
+        """Those of the next step: they fall linearly with the gradient steps done."""
         share = 1.0 - (1.0 - self.config.lr_final) * min(self.updates / self.total_updates, 1.0)
         for optimiser in self.optimisers.values():
             optimiser.param_groups[0]["lr"] = optimiser.defaults["lr"] * share

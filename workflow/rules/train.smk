@@ -3,12 +3,17 @@
 # that a failed job keeps them. An orphan of a killed Snakemake is waited for. The signals that the
 # trainer answers with a checkpoint and a line reach the whole process group: `tee` ignores them and
 # ends when the trainer has.
+from safemr.experiment.resources import cores, memory_mb
+
 RECORD = RESULTS + "/runs/{task}/{variant}/seed{seed}-{digest}"
 
 
-# What a run asks of a cluster: peaks of 958 MB for the trainer and 141 for each Snakemake around it
-# were seen; what a time limit ends continues at its checkpoint when it is tried again.
-TRAINING = dict(mem_mb=1500, runtime=lambda wildcards, attempt: 60 * attempt)  # minutes
+# What a run asks of a cluster; what a time limit ends continues at its checkpoint when it is tried
+# again.
+TRAINING = dict(
+    mem_mb=lambda wildcards: memory_mb(run_of(wildcards).config),
+    runtime=lambda wildcards, attempt: 60 * attempt,  # minutes
+)
 
 
 # Not the digests themselves: a pattern of thousands is searched for each file of each run.
@@ -30,7 +35,7 @@ rule train:
     wildcard_constraints:
         variant=one_of(run.path.parts[2] for run in PLAN.trained),
         digest=DIGEST,
-    threads: 1
+    threads: lambda wildcards: cores(run_of(wildcards).config)
     resources:
         **TRAINING,
         attempt=lambda wildcards, attempt: attempt,  # from --retries; what diverged says no
