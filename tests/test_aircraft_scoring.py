@@ -224,7 +224,7 @@ def test_frontier_table_is_the_frontier(truth: unsafe_sets.Truth) -> None:
 
 
 def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
-    """Discs of known radius, which every boundary line must have."""
+    """Discs of known radius: of several runs the boundary is the middle one."""
     x, y = np.arange(-6, 6.01, 0.25), np.arange(-5, 5.01, 0.25)
     radius = np.hypot(*np.meshgrid(x, y, indexing="ij"))
     learned = {"SafeMR": [3.0 - radius], "JointSIS": [3.5 - radius, 3.75 - radius]}
@@ -244,19 +244,18 @@ def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
                 float(np.hypot(*points.T).mean())
             )
     assert drawn[style.colour("SafeMR").lower()] == pytest.approx([3.0], abs=0.02)
-    assert drawn[style.colour("JointSIS").lower()] == pytest.approx([3.5, 3.75], abs=0.02)
+    assert drawn[style.colour("JointSIS").lower()] == pytest.approx([3.625], abs=0.02)
     assert sorted(drawn[pictures.TRUE.lower()])[-2:] == pytest.approx([2.0, 2.5], abs=0.02)
-    for name, made in (("slices", figure), ("one", pictures.single(x, y, cuts[2], 1.0))):
-        pdf, png = style.save(made, tmp_path / name)
-        assert pdf.read_bytes().startswith(b"%PDF")
-        assert png.stat().st_size > 10_000
+    pdf, png = style.save(figure, tmp_path / "slices")
+    assert pdf.read_bytes().startswith(b"%PDF")
+    assert png.stat().st_size > 10_000
 
 
 def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:
     figure = pictures.frontier(FRONTIER, comparison, COVERS, handcrafted=["FAC-phih"])
     (ax,) = figure.axes
     shown = {
-        to_hex(line.get_color()): line.get_xydata()
+        to_hex(line.get_markeredgecolor()): line.get_xydata()
         for line in ax.lines
         if line.get_linestyle() == "None"
     }

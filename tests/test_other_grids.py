@@ -82,7 +82,7 @@ def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> Non
     papers = [task for task in tasks if task in paper.TABLE_I]
     expected = pd.read_csv(given["runs"])[["task", "variant", "seed"]].to_numpy().tolist()
     grid = {"tasks": tasks, "variants": list(VARIANTS), "tolerance": 1.0, "clean_share": 0.95}
-    grid["method"] = "SafeMR"
+    grid |= {"method": "SafeMR", "protocol": 1}
     names = ["return_against_cost"]
     names += ["aggregate_scores", "aggregate_safe_scores"] * bool(papers)
     pdf = [str(tmp_path / f"{name}.pdf") for name in names]
@@ -92,6 +92,7 @@ def test_tables_and_figures_of_any_grid(tasks: list[str], tmp_path: Path) -> Non
     drawn = {path.stem for path in tmp_path.glob("*.png")}
     assert drawn == {*names, "training_curves", "compute_curves"}
     params = {**grid, "expected": expected, "baselines": ["CPO"], "push": [], "layouts": 7}
+    params["flown"] = 0
     run_script("tables", input=given, params=params, output={"table": [str(tmp_path / "x.csv")]})
     first = (tmp_path / "table1.md").read_text(encoding="utf-8")
     assert ("Paper" in first) == bool(papers)

@@ -23,7 +23,7 @@ from safemr.experiment import checkpoints, resources
 from safemr.experiment.catalogue import hyperparameters, load_algorithm
 from safemr.learning import losses
 from safemr.learning.acting import Acting
-from safemr.learning.contract import TrainingDivergedError
+from safemr.learning.contract import TrainingDivergedError, process_seed
 from safemr.learning.evaluation import evaluate
 from safemr.parallel import gradients, workers
 from safemr.parallel.crew import LostError, RayCrew
@@ -424,7 +424,7 @@ def test_a_sampler_that_died_at_the_checkpoint_begins_anew() -> None:
 
 def test_every_process_draws_from_a_stream_of_its_own() -> None:
     places = [(kind, i, life) for kind in range(4) for i in range(3) for life in range(3)]
-    seeds = {workers.seed_of(seed, *place) for place in places for seed in (0, 1)}
+    seeds = {process_seed(seed, *place) for place in places for seed in (0, 1)}
     assert len(seeds) == 2 * len(places)
 
 

@@ -86,7 +86,8 @@ def test_arrays_that_are_no_policy_are_refused_when_it_is_asked_for(folder: Path
 
 def test_no_other_code_takes_a_record_apart() -> None:
     """The names of a record's files, and its unchecked parts, are for those who write or verify."""
-    own = {"experiment/records.py", "experiment/checkpoints.py"}
+    # The last reads the unfinished ones, which are no records yet.
+    own = {"experiment/records.py", "experiment/checkpoints.py", "experiment/begun.py"}
     names = {"CONFIG", "PROGRESS", "PROVENANCE", "parse_progress"}
     readers = set()
     for path in sorted((ROOT / "safemr").rglob("*.py")):

@@ -88,6 +88,12 @@ def generator(seed: int, stream: int, device: str = "cpu") -> torch.Generator:
     return torch.Generator(device).manual_seed(int(word >> np.uint64(1)))
 
 
+def process_seed(seed: int, kind: int, index: int, life: int) -> int:
+    """Seed of one of a run's processes; ``life`` counts how often it was started."""
+    (word,) = np.random.SeedSequence([seed, kind, index, life]).generate_state(1, np.uint64)
+    return int(word)
+
+
 def environment_seed(seed: int, stream: int) -> int:
     """Seed of a run's first sub-environment; ``stream`` is that of a purpose, as in `generator`.
 

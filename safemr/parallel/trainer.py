@@ -30,7 +30,7 @@ import numpy as np
 import torch
 
 from safemr.errors import UserError
-from safemr.learning.contract import MakeEnvs, TrainingDivergedError, check_finite
+from safemr.learning.contract import MakeEnvs, TrainingDivergedError, check_finite, process_seed
 from safemr.learning.episode_statistics import EpisodeStatistics
 from safemr.learning.hyperparameters import Hyperparameters
 from safemr.learning.interface import interface_of
@@ -40,7 +40,7 @@ from safemr.parallel import workers
 from safemr.parallel.crew import Crew, LostError, RayCrew
 from safemr.parallel.gradients import step, weights
 from safemr.parallel.ledger import Earnings, Flights, Numbers
-from safemr.parallel.workers import BUFFER, DRIVER, LEARNER, SAMPLER, seed_of
+from safemr.parallel.workers import BUFFER, DRIVER, LEARNER, SAMPLER
 
 MOST_LOST = 10  # tasks in a row, after which whatever is wrong will not go away
 
@@ -184,7 +184,7 @@ class Trainer:
         self._sent: tuple[int, Any] | None = None  # version of the weights sent last, and these
         self._lost_in_a_row, self._means, self._lost = 0, Means(), 0
         life = max(self._lives[SAMPLER])  # at least the number of resumptions
-        self._random = np.random.default_rng(seed_of(self._seed, DRIVER, 0, life))
+        self._random = np.random.default_rng(process_seed(self._seed, DRIVER, 0, life))
         if resumed is None:
             return crew
         try:
@@ -203,7 +203,7 @@ class Trainer:
     def _hired(self, kind: int, index: int) -> Any:
         config, crew = self.config, self._crew
         assert crew is not None
-        seed = seed_of(self._seed, kind, index, self._lives[kind][index])
+        seed = process_seed(self._seed, kind, index, self._lives[kind][index])
         if kind == SAMPLER:
             return crew.hire(
                 workers.Sampler,

@@ -28,12 +28,6 @@ Chunk = dict[str, NDArray[np.float32]]  # field of a replay memory -> [decisions
 SAMPLER, BUFFER, LEARNER, DRIVER = range(4)  # kinds, which draw from streams of their own
 
 
-def seed_of(seed: int, kind: int, index: int, life: int = 0) -> int:
-    """The seed of a process of a run; ``life`` counts how often it was started."""
-    (word,) = np.random.SeedSequence([seed, kind, index, life]).generate_state(1, np.uint64)
-    return int(word)
-
-
 class Sizes(NamedTuple):
     """What networks and memory need to know of the task."""
 

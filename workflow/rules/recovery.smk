@@ -12,7 +12,8 @@ from pathlib import Path
 from safemr.experiment.locks import ProcessLock
 
 # What this workflow makes; what others left in the same .snakemake is theirs.
-MADE = [Path(RESULTS, name) for name in ("runs", "summary", "tables", "logs")] + [Path(FIGURES)]
+MADE = [Path(RESULTS, name) for name in ("runs", "summary", "tables", "logs", "report.html")]
+MADE += [Path(FIGURES)]
 IS_RECORD = re.compile(r"seed\d+-[0-9a-f]{12}").fullmatch
 
 
