@@ -1,6 +1,10 @@
 """How near a training run is to the least time its own arithmetic and physics need.
 
-    python -m benchmarks.training [--algorithms ...] [--task NAME] [--blocks N] [--output FILE.csv]
+    python -m benchmarks.training [--algorithms ...] [--task NAME] [--config FILE] [--blocks N]
+        [--output FILE.csv]
+
+Settings are an algorithm's defaults, or what a configuration's runs of it on the task have: their
+hyperparameters, how the learner meets the task and the task's settings.
 
 The floor of a part of the program is the time of what it cannot avoid: raw ``mj_step`` from the
 run's own states for the environment, and its matrix products, each timed alone at its own shape,
@@ -35,12 +39,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from benchmarks.environments import raw_rate
 from envs.navigation_batch import NavigationBatch
 from envs.tasks import NAVIGATION_TASKS
-from safemr.experiment.planning import load_algorithm
-from safemr.experiment.train import make_envs
+from safemr.experiment.config import load
+from safemr.experiment.planning import load_algorithm, resolve
 from safemr.learning.evaluation import evaluate
+from safemr.learning.interface import Interface
+from safemr.tasks import make_envs
 
 OFF_POLICY = ("safemr", "joint_sis", "fac", "sac_lagrangian")
 ON_POLICY = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
+BACKENDS = ("torch", "fused")
 COLUMNS = ("algorithm", "backend", "part", "ms", "floor_ms", "mflop")
 REST = "loop, logging"
 
@@ -57,7 +64,7 @@ PARTS = {
         "target networks": ("agent.backend", "follow_critics"),
         "certificate": ("agent", "update_certificate"),
         "update, other": ("agent", "update"),
-        "episode statistics": ("_episodes", "update"),
+        "episode statistics": ("episodes", "update"),
     },
     "on_policy": {
         "environment": ("envs", "step"),
@@ -171,26 +178,34 @@ class Run:
         algorithm: str,
         task: str,
         held: int,
-        backend: str | None,
+        backend: str,
         hyperparameters: Mapping[str, Any] | None = None,
         task_settings: Mapping[str, Any] | None = None,
+        interface: Mapping[str, Any] | None = None,
+        decisions: int = 1024,
     ) -> None:
         module = importlib.import_module(f"safemr.algorithms.{algorithm}")
-        settings: dict[str, Any] = {"backend": backend, "start_steps": 512} if backend else {}
+        settings = dict(hyperparameters or {}) | {"backend": backend}
+        off_policy = load_algorithm(algorithm).family == "off_policy"
+        if off_policy:  # the middle of a run, sooner
+            settings["start_steps"] = 512
         if hasattr(module.Config, "certificate_start"):
             settings["certificate_start"] = 0.0
-        config = module.Config(**settings | dict(hyperparameters or {}))
-        described = {"name": task, "settings": dict(task_settings or {})}
-        environments = functools.partial(make_envs, described)
-        self.trainer = module.Trainer(config, environments, 100, 10**7)
+        config = module.Config(**settings)
+        self.described = {"name": task, "settings": dict(task_settings or {})}
+        self.interface = Interface.read(interface).fitted(make_envs(self.described, 1))
+        self.trainer = module.Trainer(config, self._environments, 100, 10**7)
         self.algorithm, self.backend = algorithm, backend
-        # One block: enough for every kind of update, a whole epoch where there are epochs.
-        self.block = 1024 if backend else config.epoch_steps
-        self.trainer.advance(2048 if backend else self.block)
-        if backend:
+        # One block: decisions enough for every kind of update, an epoch where there are epochs.
+        self.block = decisions * self.interface.action_repeat if off_policy else config.epoch_steps
+        self.trainer.advance(2 * self.block if off_policy else self.block)
+        if off_policy:
             self._fill_memory(held)
         self.stopwatch = Stopwatch()
         self.stopwatch.watch(self.trainer)
+
+    def _environments(self, num_envs: int) -> Any:
+        return self.interface.around(make_envs(self.described, num_envs))
 
     def _fill_memory(self, held: int) -> None:
         """Repeats the experience so far: where the samples lie decides how long gathering takes."""
@@ -237,59 +252,78 @@ class Run:
                 return shape_a, stride_a, columns, (agent.config.hidden * width, width, 1)
         return product
 
-    def physics_ms(self, task: str, rounds: int = 3, steps: int = 40) -> float:
+    def physics_ms(self, rounds: int = 3, steps: int = 40) -> float:
         """CPU milliseconds of 1,000 raw steps from the states that training is in."""
         envs = self.trainer.envs.unwrapped
-        raw = NavigationBatch(NAVIGATION_TASKS[task], envs.num_envs)
+        raw = NavigationBatch(envs.task, envs.num_envs)
         rng = np.random.default_rng(0)
+        repeat = self.interface.action_repeat
         rates = []
         for _ in range(rounds):
             raw.set_state(envs.get_state())
-            actions = rng.uniform(-1, 1, (steps, envs.num_envs, 2)).astype(np.float32)
-            rates.append(raw_rate(raw, actions))
+            chosen = rng.uniform(-1, 1, (-(-steps // repeat), envs.num_envs, 2)).astype(np.float32)
+            rates.append(raw_rate(raw, self.interface.scaled(chosen).repeat(repeat, 0)[:steps]))
         return 1e6 / median(rates)
 
 
-def measure(algorithm: str, task: str, blocks: int, held: int) -> list[dict[str, Any]]:
-    """Rows of COLUMNS for one algorithm: parts, then the evaluation of a policy."""
+def settings_of(config: Path, task: str) -> dict[str, dict[str, Any]]:
+    """What a configuration's runs on a task are trained with, by algorithm: `Run`'s keywords."""
+    found: dict[str, dict[str, Any]] = {}
+    for run in resolve(load([config])).trained:
+        if run.task == task:
+            algorithm = run.config["algorithm"]
+            found.setdefault(
+                algorithm["name"],
+                {
+                    "hyperparameters": algorithm["hyperparameters"],
+                    "task_settings": run.config["task"]["settings"],
+                    "interface": run.config.get("interface"),
+                },
+            )
+    return found
+
+
+def measure(
+    algorithm: str, task: str, blocks: int, held: int, settings: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """Rows of COLUMNS for one algorithm, part by part; settings: `settings_of` it."""
     family = load_algorithm(algorithm).family
-    backends = ("torch", "fused") if family == "off_policy" else (None,)
-    runs = [Run(algorithm, task, held, backend) for backend in backends]
+    runs = [Run(algorithm, task, held, backend, **settings) for backend in BACKENDS]
     products = runs[0].products()
     times: list[dict[str, list[float]]] = [defaultdict(list) for _ in runs]
-    floors: dict[str, list[float]] = defaultdict(list)
+    floors: list[dict[str, list[float]]] = [defaultdict(list) for _ in runs]
     for _ in range(blocks):
         # Taken in turn with training: the machine's speed changes with what its other users do.
-        floor: dict[str, float] = defaultdict(float, environment=runs[0].physics_ms(task))
+        shared: dict[str, float] = defaultdict(float)
         for (part, product), count in products.items():
-            floor[part] += 1e3 * count * product_seconds(product)
-        for part, spent in floor.items():
-            floors[part].append(spent)
-        for run, found in zip(runs, times, strict=True):
+            shared[part] += 1e3 * count * product_seconds(product)
+        for run, found, floor in zip(runs, times, floors, strict=True):
+            for part, spent in (shared | {"environment": run.physics_ms()}).items():
+                floor[part].append(spent)
             for part, spent in run.advance().items():
                 found[part].append(spent)
     work: dict[str, float] = defaultdict(float)
     for (part, product), count in products.items():
         work[part] += 1e-6 * count * flop(product)
     rows = []
-    for run, found in zip(runs, times, strict=True):
+    for run, found, floor in zip(runs, times, floors, strict=True):
         for part in (*PARTS[family], REST):
-            spent, floor = (median(values[part] or [0.0]) for values in (found, floors))
-            values = (algorithm, run.backend or "torch", part, spent, floor, work[part])
+            spent, least = (median(values[part] or [0.0]) for values in (found, floor))
+            values = (algorithm, run.backend, part, spent, least, work[part])
             rows.append(dict(zip(COLUMNS, values, strict=True)))
     return rows
 
 
-def measure_evaluation(task: str, episodes: int) -> dict[str, Any]:
+def measure_evaluation(task: str, episodes: int, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The row of a deterministic evaluation, whose floor is the physics alone."""
-    run = Run("fac", task, 1, "fused")
-    envs = make_envs({"name": task, "settings": {}}, episodes)
+    run = Run("fac", task, 1, "fused", **settings)
+    envs = make_envs(run.described, episodes)
     begun = time.process_time()
     result = evaluate(run.trainer.policy, envs, 10_000)
     steps = result["episodes"] * result["length"]
     spent = 1e6 * (time.process_time() - begun) / steps
     run.trainer.envs = envs
-    values = ("evaluation", "-", "evaluation", spent, run.physics_ms(task), 0.0)
+    values = ("evaluation", "-", "evaluation", spent, run.physics_ms(), 0.0)
     return dict(zip(COLUMNS, values, strict=True))
 
 
@@ -335,18 +369,23 @@ def main(arguments: list[str] | None = None) -> int:
     every = (*OFF_POLICY, *ON_POLICY)
     parser.add_argument("--algorithms", nargs="+", choices=every, default=every)
     parser.add_argument("--task", choices=NAVIGATION_TASKS, default="Pillars-0.15-Goal")
+    parser.add_argument("--config", type=Path, help="a configuration with runs on the task")
     parser.add_argument("--blocks", type=int, default=9)
     parser.add_argument("--held", type=int, default=150_000, help="transitions in the memory")
     parser.add_argument("--episodes", type=int, default=20, help="of the evaluation")
     parser.add_argument("--output", type=Path, help="write the rows as CSV, too")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    settings: dict[str, dict[str, Any]] = {}
+    if options.config is not None:
+        settings = settings_of(options.config, options.task)
     rows = []
     for algorithm in options.algorithms:
         blocks = options.blocks if algorithm in OFF_POLICY else max(options.blocks // 3, 1)
-        rows += measure(algorithm, options.task, blocks, options.held)
+        chosen = settings.get(algorithm, {})
+        rows += measure(algorithm, options.task, blocks, options.held, chosen)
         print(f"{algorithm} measured", file=sys.stderr, flush=True)
-    rows.append(measure_evaluation(options.task, options.episodes))
+    rows.append(measure_evaluation(options.task, options.episodes, settings.get("fac", {})))
     print(markdown(rows))
     print(summary(rows))
     if options.output is not None:
