@@ -473,7 +473,20 @@ def test_a_variant_stands_above_the_tuning_of_a_task() -> None:
     assert set(values.values()) == {4}
 
 
+def test_a_variant_may_have_seeds_of_its_own() -> None:
+    plan = resolve(changed(("algorithms", "PPO-L", "seeds"), [101, 105]))
+    seeds = {
+        variant: {run.seed for run in plan.navigation if run.variant == variant}
+        for variant in ("SafeMR", "PPO-L")
+    }
+    assert seeds == {"SafeMR": set(VALID["seeds"]), "PPO-L": {101, 105}}
+    for wrong in ([], [1, 1], "0-4", [-1]):
+        with pytest.raises(UserError, match="algorithms.PPO-L.seeds"):
+            resolve(changed(("algorithms", "PPO-L", "seeds"), wrong))
+
+
 CHANGES: list[tuple[tuple[str, ...], Any, int]] = [
+    (("algorithms", "PPO-L", "seeds"), [101, 105], 2),  # one more on each of two tasks
     (("seeds",), [100, 102], 4 + 2),  # two tasks x two algorithms, one outside variant on two
     (("budget", "on_policy"), 2500, 4),
     (("budget", "off_policy"), 1100, 2 + 1 + 1),  # Pillars, its point, the aircraft

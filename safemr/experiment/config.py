@@ -62,6 +62,7 @@ class Variant:
     algorithm: str
     overrides: Mapping[str, Any]
     role: str | None = None  # None: that of the algorithm
+    seeds: tuple[int, ...] | None = None  # None: those of the section
 
 
 @dataclass(frozen=True)
@@ -328,7 +329,10 @@ def _variants(value: Any, where: str) -> dict[str, Variant]:
         role = settings.pop("role", None)
         if "role" in entry and role not in ROLES:
             raise unknown("role", role, ROLES, f"{where}.{label}")
-        variants[label] = Variant(algorithm, settings, role)
+        seeds = None
+        if "seeds" in settings:
+            seeds = seeds_in(settings.pop("seeds"), f"{where}.{label}.seeds")
+        variants[label] = Variant(algorithm, settings, role, seeds)
     if not variants:
         raise UserError(f"{where} is empty")
     return variants

@@ -271,7 +271,7 @@ class _Resolver:
             steps = self._steps(task, algorithm.family)
             where = f"{section}.{label}"
             check_setting(algorithm, values, described, steps, where, interface.action_repeat)
-            for seed in seeds:
+            for seed in variant.seeds or seeds:
                 yield make_run(
                     described,
                     algorithm,
