@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -139,30 +140,46 @@ def test_the_least_one_is_the_least_of_the_grid(encounters: Encounters) -> None:
         smallest(encounters, PAPER, ((0.0, 0.0, 1.0), (0.1, 0.01, 1.1)), points=2)
 
 
-def guarded(holds: Any, zeta: tuple[float, float, float]) -> safemr_guarded.Agent:
-    """An agent whose encounters are `holds`."""
+def guarded(worst: Any, zeta: tuple[float, float, float]) -> safemr_guarded.Agent:
+    """An agent whose encounters have the worst least g ``worst(zeta)``."""
     agent = safemr_guarded.Agent(safemr_guarded.Config(hidden=8), 3, 2, 0.25, 0, 10_000)
     agent.zeta.copy_(torch.tensor(zeta))
 
     def verdict(asked: Any, eta: float) -> Any:
-        return SimpleNamespace(feasible=holds(*asked), worst=-asked.sigma)
+        return SimpleNamespace(feasible=worst(*asked) < 0, worst=worst(*asked))
 
-    agent.encounters = SimpleNamespace(refuted=lambda *asked: False, verdict=verdict)
+    agent.encounters = SimpleNamespace(
+        refuted=lambda *asked: False,
+        verdict=verdict,
+        remembered_worst=lambda asked, eta: worst(*asked),
+    )
     return agent
 
 
-def test_a_step_that_loses_feasibility_is_refused_by_its_parts() -> None:
+def test_a_step_that_loses_feasibility_is_left_its_part_along_the_boundary() -> None:
     start, proposed = (0.3, 1.0, 2.0), torch.tensor([0.2, 0.9, 2.1])
-    free = guarded(lambda sigma, k, n: True, start)
+    free = guarded(lambda sigma, k, n: -1.0, start)
     assert torch.equal(free.admitted(proposed), proposed)
-    walled = guarded(lambda sigma, k, n: k > 0.95, start)
-    assert walled.admitted(proposed).tolist() == pytest.approx([0.2, 1.0, 2.1])
-    stopped = guarded(lambda sigma, k, n: (sigma, k, n) == tuple(map(float, stopped.zeta)), start)
+    # feasible from k = 0.95 on: sigma and n move as proposed, k to the wall
+    walled = guarded(lambda sigma, k, n: 0.95 - k, start)
+    assert walled.admitted(proposed).tolist() == pytest.approx([0.2, 0.95, 2.1], abs=2e-4)
+    # feasible where k + n >= 3.05: the excess of 0.05 is divided between the two
+    oblique = guarded(lambda sigma, k, n: 3.05 - k - n, start)
+    assert oblique.admitted(proposed).tolist() == pytest.approx([0.2, 0.925, 2.125], abs=2e-4)
+    # nothing but the present zeta is feasible, and no direction leads back
+    stopped = guarded(lambda *asked: -1.0 if asked == tuple(stopped.zeta.tolist()) else 1.0, start)
     assert torch.equal(stopped.admitted(proposed), stopped.zeta)
 
 
+def test_what_the_box_holds_back_does_not_help() -> None:
+    """sigma would have to fall below its bound: k alone brings the step back."""
+    agent = guarded(lambda sigma, k, n: sigma - 0.04 + 0.95 - k, (0.06, 1.0, 2.0))
+    found = agent.admitted(torch.tensor([0.05, 0.9, 2.0]))
+    assert found.tolist() == pytest.approx([0.05, 0.96, 2.0], abs=2e-4)
+
+
 def test_from_an_infeasible_start_only_what_is_better_is_admitted() -> None:
-    lost = guarded(lambda sigma, k, n: False, (0.3, 1.0, 2.0))  # the worst g is -sigma here
+    lost = guarded(lambda sigma, k, n: 5.0 - sigma**2, (0.3, 1.0, 2.0))  # out of the box's reach
     assert lost.admitted(torch.tensor([0.4, 1.0, 2.0]))[0] == pytest.approx(0.4)
     assert lost.admitted(torch.tensor([0.2, 1.0, 2.0]))[0] == pytest.approx(0.3)
 
@@ -172,19 +189,42 @@ def small(module: Any, **settings: Any) -> Any:
     return module.Trainer(config, lambda count: make_envs(TASK, count), 0, 4_000)
 
 
-def test_a_guarded_descent_stays_feasible() -> None:
-    """With a weight that drives zeta out of the box where JointSIS would follow."""
+def test_a_guarded_descent_stays_feasible_also_when_continued(envs: Any) -> None:
+    """With weights that drive zeta out of what is feasible where SafeMR would follow."""
     start = {"sigma": 0.3, "k": 1.0, "n": 1.5, "a": 1.0, "b": 1.0, "certificate_start": 0.0}
-    trainer = small(safemr_guarded, certificate_delay=64, certificate_travel=1.0, **start)
+    settings = {"certificate_delay": 32, "certificate_travel": 4.0, **start}
+
+    def begun() -> Any:
+        trainer = small(safemr_guarded, **settings)
+        trainer.agent.encounters = Encounters(envs, cell=COARSE, bearings=12, spacing=0.1)
+        return trainer
+
+    trainer = begun()
     begin = trainer.agent.zeta.clone()
+    trainer.advance(2_000)
+    middle = copy.deepcopy(trainer.state_dict())
+    assert len(middle["agent"]["encounters"])  # something had refuted a step by then
     trainer.advance(4_000)
     zeta = Zeta(*trainer.agent.zeta.tolist())
     assert trainer.agent.zeta[1] < begin[1] - 0.1
     assert trainer.agent.encounters.verdict(zeta).feasible
-    without = small(safemr, certificate_delay=64, certificate_travel=1.0, **start)
+    # continued from its checkpoint it ends at the same zeta: what it remembers is saved, too
+    again = begun()
+    again.load_state_dict(middle)
+    again.advance(4_000)
+    assert torch.equal(again.agent.zeta, trainer.agent.zeta)
+    without = small(safemr, **settings)
     without.advance(4_000)
     lost = Zeta(*without.agent.zeta.tolist())
     assert not trainer.agent.encounters.verdict(lost).feasible
+
+
+def test_what_was_remembered_tells_how_far_a_certificate_is_from_keeping_it(envs: Any) -> None:
+    encounters = Encounters(envs, cell=COARSE, bearings=24, spacing=0.05)
+    assert encounters.remembered_worst(PHI_0) == -np.inf
+    verdict = encounters.verdict(PHI_0)
+    assert 0.0 < encounters.remembered_worst(PHI_0) <= verdict.worst
+    assert encounters.remembered_worst(PHI_H) < 0.0 or not encounters.verdict(PHI_H).feasible
 
 
 def test_fac_with_the_oracle_keeps_what_it_found(encounters: Encounters) -> None:

@@ -84,7 +84,7 @@ class Encounters:
         self._envs = envs
         # How many encounters an action has kept that none before it did: the best are tried first.
         self._kept = np.zeros(actions.shape[1], np.int64)
-        self._hard = np.zeros((0, 3))  # motion, place: what refuted certificates before
+        self.hard = np.zeros((0, 3))  # motion, place: some of what refuted certificates before
         self._speeds = np.hypot(self.motions[:, 0], self.motions[:, 1])
 
     def verdict(self, zeta: Parameters, eta: float = 0.0) -> Verdict:
@@ -115,12 +115,29 @@ class Encounters:
     def refuted(self, zeta: Parameters, eta: float = 0.0) -> bool:
         """Whether a place that refuted another certificate refutes this one: what is quickly
         told, True always being right."""
-        rows, places = self._hard[:, 0].astype(int), self._hard[:, 1:]
+        rows, places = self.hard[:, 0].astype(int), self.hard[:, 1:]
         near = np.hypot(*places.T) <= largest_distance(zeta, self.d_min, self.action_repeat)
         for part in np.array_split(np.flatnonzero(near), 1 + len(rows) // REMEMBERED):
             if len(part) and len(self._without_safe_action(rows[part], places[part], zeta, eta)[0]):
                 return True
         return False
+
+    def remembered_worst(self, zeta: Parameters, eta: float = 0.0) -> float:
+        """The largest least g at the places that refuted certificates before: how far this one is
+        from keeping all of them, a continuous function of zeta, and below 0 where it does.
+
+        Raises UserError where phi stays positive far from the obstacle.
+        """
+        rows, places = self.hard[:, 0].astype(int), self.hard[:, 1:]
+        near = np.hypot(*places.T) <= largest_distance(zeta, self.d_min, self.action_repeat)
+        rows, places = rows[near], places[near]
+        phi = self._phi(places, self.motions[rows, :2], zeta)
+        least = np.full(len(rows), np.inf)
+        for action in range(self._moved.shape[1]):
+            moved = places - self._moved[rows, action]
+            after = self._phi(moved, self._velocity[rows, action], zeta)
+            least = np.minimum(least, constraint(phi, after, eta))
+        return float(least.max(initial=-np.inf))
 
     def unsafe_area(self, zeta: Parameters, points: int = 160) -> float:
         """Mean area of {phi > 0} beyond the disc of d_min [m^2], over reachable motions and all
@@ -181,7 +198,7 @@ class Encounters:
     def _remember(self, places: Array) -> None:
         """Keep some of the places, spread over them."""
         chosen = np.linspace(0, len(places) - 1, min(len(places), REMEMBERED)).astype(int)
-        self._hard = np.concatenate([self._hard, places[chosen]])
+        self.hard = np.concatenate([self.hard, places[chosen]])
 
     def _state(self, motion: int, place: Array) -> Array:
         """Distance, bearing, course, speed and turn rate."""
