@@ -16,13 +16,13 @@ from safemr.report.findings import Verdict
 ROWS: Mapping[str, Mapping[str, str]] = {
     "SafeMR returns the most of all safe algorithms": {"highest_return": ""},
     "SafeMR ends without any violation": {"zero_violations": ""},
-    "The CMDP baselines and phi_0 are not safe, on any task": {"unsafe": ""},
-    "The same return more than SafeMR, on every task": {"higher_return": ""},
+    "PPO-L, TRPO-L, CPO and phi_0 are unsafe on every task": {"unsafe": ""},
+    "These four return more than SafeMR, on every task": {"higher_return": ""},
     "JointSIS and phi_h are safe, but return less": {"safe_but_lower": ""},
-    "Two aircraft: unsafe sets": {
-        "conservativeness": "SafeMR's is smaller than JointSIS's",
-        "coverage": "SafeMR's covers the true one",
-        "handcrafted_coverage": "phi_h's does not cover the true one",
+    "Two aircraft, whose true unsafe set is known": {
+        "conservativeness": "SafeMR's unsafe set is smaller than JointSIS's",
+        "coverage": "SafeMR's contains the true one",
+        "handcrafted_coverage": "phi_h's lacks a part of the true one",
     },
     "Every state has a safe action": {
         "feasibility_paper": "under the paper's certificates",
@@ -30,8 +30,8 @@ ROWS: Mapping[str, Mapping[str, str]] = {
     },
     "Any [a, b] works, and training converges": {
         "sensitivity_return": "return above JointSIS's",
-        "sensitivity_cost": "costs vanish",
-        "slowest_certificate": "zeta settles last",
+        "sensitivity_cost": "violations vanish",
+        "slowest_certificate": "zeta = (sigma, k, n) settles last",
         "bounded": "losses stay bounded",
     },
 }
