@@ -145,21 +145,12 @@ def test_what_the_cmdp_baselines_constrain_on_push_is_told_as_recorded() -> None
             np.testing.assert_allclose(column(path, "train_cost"), indicator)
 
 
-def test_numbers_of_unseen_layouts_and_pairs_are_the_tables() -> None:
+def test_numbers_of_the_variants_are_the_tables() -> None:
     tables = ROOT / "results/variants/tables"
     said = text_of(ALGORITHMS)
-    pairs = cells((tables / "differences.md").read_text(), "Pillars-0.15-Goal", "JointSIS-literal")
-    mean, half = pairs[0].split(" ± ")
-    assert f"(+{float(mean):.1f} ± {float(half.split()[0]):.1f})" in said
     unseen = (tables / "unseen_layouts.md").read_text()
-    row = cells(unseen, "Pillars-0.15-Goal", "JointSIS-literal")
-    mean, half = row[4].split(" ± ")
-    more = f"returns {-float(mean):.1f} ± {float(half):.1f} *more* than that, with violations in"
-    assert f"{more} {row[6].split()[0]} of 500 episodes" in said
     violating = cells(unseen, "Pillars-0.15-Goal", "SafeMR-floor-0.02")[6]
     assert f"violations in {violating} unseen episodes" in said
-    released = cells(unseen, "Pillars-0.15-Goal", "JointSIS-released")[4].split(" ± ")
-    assert f"{float(released[0]):.1f} ± {float(released[1]):.1f} less than SafeMR" in said
     results = (tables / "results.md").read_text()
     for variant, form in (
         ("SafeMR-floor-0", "is {} at a sigma"),
