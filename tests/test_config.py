@@ -481,7 +481,7 @@ def test_a_variant_may_have_seeds_of_its_own() -> None:
     }
     assert seeds == {"SafeMR": set(VALID["seeds"]), "PPO-L": {101, 105}}
     for wrong in ([], [1, 1], "0-4", [-1]):
-        with pytest.raises(UserError, match="algorithms.PPO-L.seeds"):
+        with pytest.raises(UserError, match=r"algorithms\.PPO-L\.seeds"):
             resolve(changed(("algorithms", "PPO-L", "seeds"), wrong))
 
 

@@ -126,6 +126,16 @@ def test_a_label_is_the_intervals(dirty, label):
     assert RULE.label(scores, TASK, "other") is None
 
 
+@pytest.mark.parametrize(
+    ("dirty", "said"), [(DIRTY, "none is safe"), (OPEN, "none is shown to be safe")]
+)
+def test_table_one_tells_unsafe_baselines_from_undecided_ones(dirty, said):
+    scores = grid(JointSIS=(dirty, 15.0), FAC_phih=(DIRTY, 14.0))
+    display = tables.table_one(scores, tasks=[TASK], rule=RULE).display
+    rows = dict(zip(display["Expected return"], display[TASK], strict=True))
+    assert rows["Highest among safe baselines"] == said
+
+
 def test_single_runs_are_judged_by_their_clean_episodes_alone():
     scores = grid(SafeMR=([0, 5, 6, 0, 0], 20.0))
     lost = RULE.safe_returns(scores)

@@ -217,7 +217,9 @@ def table_one(
     highest, difference, improvement = list(lines.values())[1:4]
     for column, r in enumerate(rows):
         if r["baseline_runs"] and not r["baseline"]:
-            highest[column], difference[column] = "none is safe", ABSENT
+            labels = {rule.label(scores, str(r["task"]), name) for name in baselines}
+            none = "none is shown to be safe" if "not decided" in labels else "none is safe"
+            highest[column], difference[column] = none, ABSENT
             improvement[column] = ABSENT
         elif r["baseline"] and np.isnan(data["improvement"][column]):
             improvement[column] = "undefined (baseline ≤ 0)"
