@@ -77,6 +77,8 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
     # config/oracle.yaml
     "FAC-oracle": ("#882255", _DOTTED, "p", "FAC-oracle"),
     "SafeMR-guarded": ("#117733", _SOLID, "h", "SafeMR-guarded"),
+    "SafeMR-guarded-above": ("#44AA99", _DASHED, "h", "SafeMR-guarded-above"),
+    "SafeMR-guarded-below": ("#999933", _SHORT, "h", "SafeMR-guarded-below"),
     # config/variants.yaml
     "SafeMR-literal": ("#AA3377", _DASH_DOTTED, ">", "SafeMR-literal"),
     "SafeMR-floor-0.02": ("#CCBB44", _DASH_DOTTED, "h", "SafeMR-floor-0.02"),
