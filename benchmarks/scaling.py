@@ -54,7 +54,7 @@ def single(rounds: int) -> list[dict[str, Any]]:
     live = {case: run_of(*case) for case in cases}
     for _ in range(rounds):
         for case, run in live.items():
-            times[case].append(sum(run.advance().values()))
+            times[case].append(sum(run.advance()[0].values()))
     rows = []
     for factor, value in cases:
         base = median(times[factor, FACTORS[factor][0]])

@@ -6,8 +6,8 @@
 Settings are an algorithm's defaults, or what a configuration's runs of it on the task have: their
 hyperparameters, how the learner meets the task and the task's settings.
 
-The floor of a part of the program is the time of what it cannot avoid: raw ``mj_step`` from the
-run's own states for the environment, and its matrix products, each timed alone at its own shape,
+The floor of a part of the program is the time of what it cannot avoid: the simulator's own calls
+for the environment, timed in the run, and its matrix products, each timed alone at its own shape,
 by whichever of PyTorch and scipy's BLAS is faster. Everything else is counted as overhead:
 activations, biases, losses, Adam, gathering samples, sensors, resets, Python. The products are
 those that the ``torch`` backend asks PyTorch for, recorded while it trains, without the gradients
@@ -31,13 +31,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import mujoco
 import numba
 import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from benchmarks.environments import raw_rate
-from envs.navigation_batch import NavigationBatch
+from envs import navigation_physics
 from envs.tasks import NAVIGATION_TASKS
 from safemr.experiment.config import load
 from safemr.experiment.planning import load_algorithm, resolve
@@ -111,6 +111,34 @@ class Stopwatch:
                 self.parts.pop()
 
         return timed
+
+
+class SimulatorClock:
+    """CPU seconds in the simulator while it is entered: from `mj_step2` to `mj_forward`, between
+    which a step of `envs.navigation_physics` calls nothing else."""
+
+    def __init__(self) -> None:
+        self.spent = self._begun = 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(mujoco, name)
+
+    def mj_step2(self, model: Any, data: Any) -> None:
+        self._begun = time.process_time()
+        mujoco.mj_step2(model, data)
+
+    def mj_forward(self, model: Any, data: Any) -> None:
+        mujoco.mj_forward(model, data)
+        if self._begun:  # a reset calls it, too
+            self.spent += time.process_time() - self._begun
+            self._begun = 0.0
+
+    def __enter__(self) -> SimulatorClock:
+        navigation_physics.mujoco = self  # type: ignore[assignment]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        navigation_physics.mujoco = mujoco
 
 
 Product = tuple[torch.Size, tuple[int, ...], torch.Size, tuple[int, ...]]
@@ -219,14 +247,21 @@ class Run:
         size = times * state["size"]
         replay.load_state_dict({"head": size, "size": size, "fields": fields})
 
-    def advance(self) -> dict[str, float]:
-        """CPU milliseconds by part per 1,000 steps of one block."""
+    def advance(self) -> tuple[dict[str, float], float]:
+        """CPU milliseconds by part per 1,000 steps of one block, and those in the simulator.
+
+        Timed in the run, since what a step costs changes within an episode: a box that was just
+        placed is awake, one at rest sleeps. Reading the clock twice a step adds one percent.
+        """
         trainer, before = self.trainer, self.trainer.step
         self.stopwatch.reset()
-        trainer.advance(before + self.block)
+        with SimulatorClock() as clock:
+            trainer.advance(before + self.block)
         self.stopwatch.lap()
-        steps = trainer.step - before
-        return {part: 1e6 * spent / steps for part, spent in self.stopwatch.spent.items()}
+        each = 1e6 / (trainer.step - before)
+        return {part: each * spent for part, spent in self.stopwatch.spent.items()}, (
+            each * clock.spent
+        )
 
     def products(self, blocks: int = 2) -> dict[tuple[str, Product], float]:
         """Matrix products per 1,000 steps."""
@@ -251,19 +286,6 @@ class Run:
                 width = agent.action_dim
                 return shape_a, stride_a, columns, (agent.config.hidden * width, width, 1)
         return product
-
-    def physics_ms(self, rounds: int = 3, steps: int = 40) -> float:
-        """CPU milliseconds of 1,000 raw steps from the states that training is in."""
-        envs = self.trainer.envs.unwrapped
-        raw = NavigationBatch(envs.task, envs.num_envs)
-        rng = np.random.default_rng(0)
-        repeat = self.interface.action_repeat
-        rates = []
-        for _ in range(rounds):
-            raw.set_state(envs.get_state())
-            chosen = rng.uniform(-1, 1, (-(-steps // repeat), envs.num_envs, 2)).astype(np.float32)
-            rates.append(raw_rate(raw, self.interface.scaled(chosen).repeat(repeat, 0)[:steps]))
-        return 1e6 / median(rates)
 
 
 def settings_of(config: Path, task: str) -> dict[str, dict[str, Any]]:
@@ -290,6 +312,8 @@ def measure(
     family = load_algorithm(algorithm).family
     runs = [Run(algorithm, task, held, backend, **settings) for backend in BACKENDS]
     products = runs[0].products()
+    for run in runs[1:]:  # all at the same stage: what a step of the simulator costs depends on it
+        run.products()
     times: list[dict[str, list[float]]] = [defaultdict(list) for _ in runs]
     floors: list[dict[str, list[float]]] = [defaultdict(list) for _ in runs]
     for _ in range(blocks):
@@ -298,9 +322,10 @@ def measure(
         for (part, product), count in products.items():
             shared[part] += 1e3 * count * product_seconds(product)
         for run, found, floor in zip(runs, times, floors, strict=True):
-            for part, spent in (shared | {"environment": run.physics_ms()}).items():
+            parts, simulator = run.advance()
+            for part, spent in (shared | {"environment": simulator}).items():
                 floor[part].append(spent)
-            for part, spent in run.advance().items():
+            for part, spent in parts.items():
                 found[part].append(spent)
     work: dict[str, float] = defaultdict(float)
     for (part, product), count in products.items():
@@ -318,12 +343,14 @@ def measure_evaluation(task: str, episodes: int, settings: Mapping[str, Any]) ->
     """The row of a deterministic evaluation, whose floor is the physics alone."""
     run = Run("fac", task, 1, "fused", **settings)
     envs = make_envs(run.described, episodes)
-    begun = time.process_time()
-    result = evaluate(run.trainer.policy, envs, 10_000)
+    with SimulatorClock() as clock:
+        result = evaluate(run.trainer.policy, envs, 10_000)
     steps = result["episodes"] * result["length"]
-    spent = 1e6 * (time.process_time() - begun) / steps
-    run.trainer.envs = envs
-    values = ("evaluation", "-", "evaluation", spent, run.physics_ms(), 0.0)
+    begun = time.process_time()
+    evaluate(run.trainer.policy, envs, 10_000)
+    spent = time.process_time() - begun
+    spent_ms, floor_ms = (1e6 * seconds / steps for seconds in (spent, clock.spent))
+    values = ("evaluation", "-", "evaluation", spent_ms, floor_ms, 0.0)
     return dict(zip(COLUMNS, values, strict=True))
 
 
