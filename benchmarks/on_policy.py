@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.training import Stopwatch
+from benchmarks.training import watch
 from safemr.learning.interface import Interface
 from safemr.tasks import make_envs
 
@@ -118,10 +118,9 @@ def compare(
     runs = []
     for backend in BACKENDS:
         config = module.Config(backend=backend, **overrides)
-        trainer, stopwatch = module.Trainer(config, met, 100, 10**9), Stopwatch()
+        trainer = module.Trainer(config, met, 100, 10**9)
         trainer.advance(1)
-        stopwatch.watch(trainer)
-        runs.append((trainer, stopwatch, []))
+        runs.append((trainer, watch(trainer), []))
     for _ in range(epochs):
         for trainer, stopwatch, samples in runs:
             stopwatch.reset()
