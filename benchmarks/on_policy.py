@@ -5,10 +5,9 @@
 Settings: ``grid`` are the defaults of each algorithm's Config (what config/config.yaml trains
 with); ``published`` restores the passes and network of safety-starter-agents and of the JointSIS
 authors' comparison; ``omnisafe`` is PPO-Lagrangian with the network, epoch and number of passes of
-OmniSafe 0.5.0 (64x64, 20,000 steps, at most 40 passes) and larger minibatches; OmniSafe's own rate
-on SafetyPointGoal1 was about 140 steps/s on one core of a machine of this kind. Passes are those
-that were made, after PPO's early stop. One thread; process CPU time, which other programs disturb
-less.
+OmniSafe 0.5.0 (64x64, 20,000 steps, at most 40 passes) and larger minibatches; OmniSafe itself is
+measured beside it by `benchmarks.peers`. Passes are those that were made, after PPO's early stop.
+One thread; process CPU time, which other programs disturb less.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.training import Stopwatch
+from benchmarks.training import watch
 from safemr.learning.interface import Interface
 from safemr.tasks import make_envs
 
@@ -40,7 +39,6 @@ OMNISAFE = {
     "value_passes": 40,
     "value_batch": 2_000,
 }
-OMNISAFE_STEPS_PER_SECOND = 140.0
 PARTS = ("_collect", "update_policy", "_fit_critics")
 BACKENDS = ("torch", "fused")
 HELD = {"num_envs": 16, "epoch_steps": 16_000, "value_batch": 320}
@@ -97,7 +95,6 @@ def measure(
         "policy_passes": round(metrics.get("policy_passes", np.nan), 1),
         "value_passes": config.value_passes,
         **shares,
-        "times_omnisafe": round(rate / OMNISAFE_STEPS_PER_SECOND, 1) if label == "omnisafe" else "",
     }
 
 
@@ -118,10 +115,9 @@ def compare(
     runs = []
     for backend in BACKENDS:
         config = module.Config(backend=backend, **overrides)
-        trainer, stopwatch = module.Trainer(config, met, 100, 10**9), Stopwatch()
+        trainer = module.Trainer(config, met, 100, 10**9)
         trainer.advance(1)
-        stopwatch.watch(trainer)
-        runs.append((trainer, stopwatch, []))
+        runs.append((trainer, watch(trainer), []))
     for _ in range(epochs):
         for trainer, stopwatch, samples in runs:
             stopwatch.reset()

@@ -26,7 +26,7 @@ import importlib
 import sys
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -37,6 +37,7 @@ import numpy as np
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from benchmarks.stopwatch import REST, Stopwatch
 from envs import navigation_physics
 from envs.tasks import NAVIGATION_TASKS
 from safemr.experiment.config import load
@@ -49,7 +50,6 @@ OFF_POLICY = ("safemr", "joint_sis", "fac", "sac_lagrangian")
 ON_POLICY = ("ppo_lagrangian", "trpo_lagrangian", "cpo")
 BACKENDS = ("torch", "fused")
 COLUMNS = ("algorithm", "backend", "part", "ms", "floor_ms", "mflop")
-REST = "loop, logging"
 
 # Part of the program -> where it is done, for each family; times of nested parts are exclusive.
 PARTS = {
@@ -77,40 +77,13 @@ PARTS = {
 }
 
 
-class Stopwatch:
-    """CPU seconds by part; a part does not include the parts inside it."""
-
-    def __init__(self) -> None:
-        self.spent: dict[str, float] = defaultdict(float)
-        self.parts = [REST]
-        self._last = time.process_time()
-
-    def lap(self) -> None:
-        now = time.process_time()
-        self.spent[self.parts[-1]] += now - self._last
-        self._last = now
-
-    def reset(self) -> None:
-        self.lap()
-        self.spent.clear()
-
-    def watch(self, trainer: Any) -> None:
-        """Times the methods of PARTS that this trainer has."""
-        for part, (path, method) in PARTS[trainer.family].items():
-            owner = functools.reduce(getattr, filter(None, path.split(".")), trainer)
-            setattr(owner, method, self._timed(part, getattr(owner, method)))
-
-    def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*arguments: Any, **keywords: Any) -> Any:
-            self.lap()
-            self.parts.append(part)
-            try:
-                return function(*arguments, **keywords)
-            finally:
-                self.lap()
-                self.parts.pop()
-
-        return timed
+def watch(trainer: Any) -> Stopwatch:
+    """A stopwatch of the parts of PARTS that this trainer has."""
+    stopwatch = Stopwatch()
+    for part, (path, method) in PARTS[trainer.family].items():
+        owner = functools.reduce(getattr, filter(None, path.split(".")), trainer)
+        stopwatch.time(part, owner, method)
+    return stopwatch
 
 
 class SimulatorClock:
@@ -229,8 +202,7 @@ class Run:
         self.trainer.advance(2 * self.block if off_policy else self.block)
         if off_policy:
             self._fill_memory(held)
-        self.stopwatch = Stopwatch()
-        self.stopwatch.watch(self.trainer)
+        self.stopwatch = watch(self.trainer)
 
     def _environments(self, num_envs: int) -> Any:
         return self.interface.around(make_envs(self.described, num_envs))
