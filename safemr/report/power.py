@@ -47,23 +47,23 @@ def of_returns(
 ) -> Table:
     """For each task and baseline: the spread, the difference observed, and what seeds can see.
 
-    flown: score table. Standard deviations are of each algorithm's runs; with three of them they
-    are rough, so the pooled one of the task's algorithms stands beside. `data` has one row
-    (task, variant).
+    flown: score table. Standard deviations are of each algorithm's runs, and pooled over the two
+    that are compared: pooled over all of a task, one that is widely spread would decide for all.
+    With three runs they are rough. `data` has one row (task, variant).
     """
     least = [smallest_seen(seeds, PRIMARY_LEVEL) for seeds in SEEDS]
     rows, lines = [], []
     for task in tasks:
         returns = {v: statistics.scores_of(flown, task, v, "eval_return") for v in
                    (method, *baselines)}  # fmt: skip
-        known = [values for values in returns.values() if len(values) > 1]
-        squares = sum(((values - values.mean()) ** 2).sum() for values in known)
-        if not squares or not len(returns[method]):
+        if not len(returns[method]):
             continue
-        pooled = float(np.sqrt(squares / sum(len(values) - 1 for values in known)))
         for variant in baselines:
-            if not len(returns[variant]):
+            known = [v for v in (returns[method], returns[variant]) if len(v) > 1]
+            squares = sum(((values - values.mean()) ** 2).sum() for values in known)
+            if not squares or not len(returns[variant]):
                 continue
+            pooled = float(np.sqrt(squares / sum(len(values) - 1 for values in known)))
             gap = float(returns[method].mean() - returns[variant].mean())
             smallest = [pooled * unit for unit in least]
             powers = [detection_power(abs(gap) / pooled, seeds, PRIMARY_LEVEL) for seeds in SEEDS]
@@ -84,8 +84,8 @@ def of_returns(
         f"What five and ten seeds can see of a difference of flown returns to {method}: standard "
         "deviations between runs; the least true difference at which Welch's "
         f"{100 * PRIMARY_LEVEL:g}% interval, that of the primary claim, excludes 0 in "
-        f"{WANTED:.0%} of {DRAWS:,} simulated experiments with the task's pooled deviation; and "
-        "the share in which it does so if the difference seen here is the true one."
+        f"{WANTED:.0%} of {DRAWS:,} simulated experiments with the pooled deviation of the two; "
+        "and the share in which it does so if the difference seen here is the true one."
     )
     return Table(
         "power", caption, pd.DataFrame(rows, columns=names), pd.DataFrame(lines, columns=heads)
