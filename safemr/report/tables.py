@@ -219,8 +219,7 @@ def table_one(
         if r["baseline_runs"] and not r["baseline"]:
             labels = {rule.label(scores, str(r["task"]), name) for name in baselines}
             none = "none is shown to be safe" if "not decided" in labels else "none is safe"
-            highest[column], difference[column] = none, ABSENT
-            improvement[column] = ABSENT
+            highest[column], difference[column], improvement[column] = none, ABSENT, ABSENT
         elif r["baseline"] and np.isnan(data["improvement"][column]):
             improvement[column] = "undefined (baseline ≤ 0)"
     display = pd.DataFrame(
