@@ -20,9 +20,10 @@ figures = {
     "return_against_cost": drawing.return_against_cost(
         final,
         params.tasks,
-        tolerance=params.tolerance,
+        tolerance=params.tolerance if params.protocol == 1 else None,
         clean_share=params.clean_share,
         unsafe=[pair for pair in pairs if not rule.is_safe(final, *pair)],
+        hollow_means=rule.marks[1],
     )
 }
 if scale:  # the paper's return is the unit

@@ -87,12 +87,13 @@ def return_against_cost(
     tolerance: float | None = None,
     clean_share: float | None = None,
     unsafe: Collection[tuple[str, str]] = (),
+    hollow_means: str = "not safe",
 ) -> Figure:
     """Return against both costs of the safety rule, one column a task.
 
     Above violating steps, up to ``tolerance`` shaded; below the share of episodes with a violation,
-    shaded where at least ``clean_share`` have none. `unsafe` (task, variant) have hollow means.
-    Scores without that share have no such row.
+    shaded where at least ``clean_share`` have none. `unsafe` (task, variant) have hollow means, of
+    which the legend says ``hollow_means``. Scores without that share have no such row.
     """
     metrics = [name for name in _RULE if (scores["metric"] == name).any()]
     wide = scores[scores["metric"].isin(["eval_return", *_RULE])].pivot_table(
@@ -128,7 +129,7 @@ def return_against_cost(
     handles = style.marks(style.ordered(wide["variant"].unique()))
     look: dict[str, Any] = {"color": "0.3", "marker": "o", "ls": "none", "ms": 6}
     handles.append(Line2D([], [], **look, label="mean, safe"))
-    handles.append(Line2D([], [], **look, mfc="none", mew=1.1, label="mean, not safe"))
+    handles.append(Line2D([], [], **look, mfc="none", mew=1.1, label=f"mean, {hollow_means}"))
     handles.append(Line2D([], [], **{**look, "ms": 2.6}, label="one seed"))
     columns = style.legend_columns([str(handle.get_label()) for handle in handles])
     figure.legend(handles=handles, loc="outside lower center", ncols=columns)
