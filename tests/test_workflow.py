@@ -144,6 +144,19 @@ def test_a_fresh_clone_trains_only_what_changed(checkout: Checkout) -> None:
     assert checkout.scheduled()["train"] == 2
 
 
+def test_a_record_that_came_after_the_plan_is_kept(checkout: Checkout) -> None:
+    """A job that waited while another made its record (the orphan of a killed Snakemake on a
+    cluster, a person) finds it: what begins then is this call, as of any job on a cluster."""
+    checkout.fill_in_records()
+    record = checkout.folder / "results" / checkout.plan().trained[0].path
+    before = {path.name: path.read_bytes() for path in record.iterdir()}
+    wanted = str((record / records.PROGRESS).relative_to(checkout.folder))
+    printed = checkout.snakemake("--force", wanted)
+    assert "already recorded" in printed
+    assert {path.name: path.read_bytes() for path in record.iterdir()} == before
+    assert "train" not in checkout.scheduled()
+
+
 def test_what_is_recorded_can_be_drawn_without_training(checkout: Checkout) -> None:
     allow = ("--config", "allow_missing=true")
     assert "none of the configured runs" in checkout.snakemake("-n", "all", *allow, check=False)

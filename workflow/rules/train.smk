@@ -3,6 +3,8 @@
 # that a failed job keeps them. An orphan of a killed Snakemake is waited for. The signals that the
 # trainer answers with a checkpoint and a line reach the whole process group: `tee` ignores them and
 # ends when the trainer has.
+from snakemake.logging import logger
+
 from safemr.experiment.resources import cores, memory_mb
 
 RECORD = RESULTS + "/runs/{task}/{variant}/seed{seed}-{digest}"
@@ -27,9 +29,15 @@ def run_of(wildcards):
     return RUNS[path]
 
 
+# A run that failed had no record before, which Snakemake would say of each of its files.
+logger.addFilter(lambda message: "no backup found" not in str(message.msg))
+
+
 rule train:
     output:
-        expand(f"{RECORD}/{{name}}", name=REQUIRED_FILES, allow_missing=True),
+        # `update`: Snakemake would remove what is there when a job begins, which may be hours after it
+        # looked: the record that meanwhile the orphan of a killed Snakemake has finished, or a person.
+        update(expand(f"{RECORD}/{{name}}", name=REQUIRED_FILES, allow_missing=True)),
     log:
         f"{LOGS}/train/{{task}}_{{variant}}_seed{{seed}}-{{digest}}.log",
     wildcard_constraints:
