@@ -9,7 +9,7 @@ from sample_scores import OTHER, RETURNS, TASK, expected_runs, score_rows
 from scipy import stats
 
 from safemr import paper
-from safemr.report import compute, differences, sensitivity, statistics, tables
+from safemr.report import compute, differences, parallel, sensitivity, statistics, tables
 
 
 @pytest.fixture
@@ -37,6 +37,43 @@ def test_compute_adds_up_the_processor_time():
     assert rows[0][2:] == ["2", "400,000", "2.0", "3,333", "510"]
     assert table.data["core_hours"].sum() == pytest.approx(640 / 3600)
     assert "0.2 core-hours" in table.caption
+
+
+def test_several_processes_beside_one():
+    """Ages and workers' seconds of the one that has workers; neither of the other."""
+    keys = {"task": TASK, "variant": "SafeMR-2-2-2", "seed": 0}
+    ages = {
+        **{"gradient_age": (1.0, 2.0), "gradient_age_max": (3.0, 5.0)},
+        **{"policy_age": (4.0, 6.0), "policy_age_max": (9.0, 8.0)},
+        **{"lost_tasks": (0.0, 1.0), "workers_cpu_s": (50.0, 90.0)},
+    }
+    progress = pd.DataFrame(
+        [
+            {**keys, "step": step, "metric": metric, "value": value}
+            for metric, values in ages.items()
+            for step, value in zip((100, 200), values, strict=True)
+        ]
+    )
+    runs = pd.DataFrame(
+        {"task": TASK, "variant": ["SafeMR", "SafeMR-2-2-2"], "seed": [0, 0], "steps": 200,
+         "cpu_s": [20.0, 30.0], "wall_s": [21.0, 80.0], "peak_rss_mb": 500.0, "cpu": "a"}
+    )  # fmt: skip
+    scores = pd.DataFrame(
+        [
+            {**keys, "metric": metric, "value": value}
+            for metric, value in (
+                *(("eval_return", 9.0), ("eval_cost_indicator", 0.5)),
+                ("eval_zero_violation_share", 0.75),
+            )
+        ]
+    )
+    (alone, several) = cells(parallel.table(scores, progress, runs))[2:]
+    assert alone[3:] == ["missing", "missing", "–", "–", "–", "–", "20", "–", "21"]
+    expected = ["9.00", "0.50", "75%", "1.5 (at most 5)", "5.0 (at most 9)", "1", "30", "90", "80"]
+    assert several[3:] == expected
+    (note,) = compute.table(runs, workers=True).notes
+    assert "the driver's time" in note
+    assert not compute.table(runs).notes
 
 
 # --- tables --------------------------------------------------------------------------------------

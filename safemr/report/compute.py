@@ -8,12 +8,14 @@ import pandas as pd
 from safemr.report.tables import ABSENT, Table, entries, missing_notes
 
 
-def table(runs: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
+def table(
+    runs: pd.DataFrame, *, missing: pd.DataFrame | None = None, workers: bool = False
+) -> Table:
     """What the runs cost: processor time, speed and memory of each variant on each task.
 
     runs: the runs table (task, variant, seed, steps, cpu_s, wall_s, peak_rss_mb, cpu). Records from
     outside need not say what they cost: means are over the runs that do, and a note counts the
-    others.
+    others. workers: some runs were made by several processes, which a note says.
     """
     rows, silent = [], []
     for task, variant in entries(runs, None):
@@ -58,4 +60,9 @@ def table(runs: pd.DataFrame, *, missing: pd.DataFrame | None = None) -> Table:
     notes = [*missing_notes(missing, None, None)]
     if silent:
         notes.append(f"Records that do not say their processor time: {'; '.join(silent)}.")
+    if workers:
+        notes.append(
+            "Of a run by several processes this is the driver's time and memory; its workers' time "
+            "is in the table of one process and several."
+        )
     return Table("compute", caption, data, display, notes)

@@ -93,6 +93,7 @@ QUESTIONS = (
     Question("What did it cost?", "Cost", {
         "Return for processor time": ("compute_curves",),
         "Time and memory of the runs": ("compute",),
+        "One process and several": ("parallel",),
     }),
 )  # fmt: skip
 REST = ("What else was made?", "More")

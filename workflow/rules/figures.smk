@@ -9,6 +9,9 @@ TABLES = {
 PUSH_TASKS = has("pushes_box")
 if PUSH_TASKS:
     TABLES["push_split"] = "../report/push_split.rst"
+PARALLEL = [run for run in PLAN.navigation if cores(run.config) > 1]
+if PARALLEL:
+    TABLES["parallel"] = "../report/parallel.rst"
 
 
 rule table_1:
@@ -16,6 +19,7 @@ rule table_1:
         scores=JUDGED,
         runs=rules.aggregate.output.runs,
         controllers=rules.controllers.output[0],
+        progress=rules.aggregate.output.progress if PARALLEL else [],
     output:
         *[report(f"{RESULTS}/tables/{name}.md", caption=caption, category="Tables")
           for name, caption in TABLES.items()],

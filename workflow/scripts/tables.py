@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr.report import compute, differences, second_protocol, statistics, tables
+from safemr.report import compute, differences, parallel, second_protocol, statistics, tables
 
 given, params = snakemake.input, snakemake.params
 learned = pd.read_csv(given.scores)
@@ -27,9 +27,12 @@ made = [
         scores, missing=missing, rule=rule, layouts=params.layouts, flown=params.flown
     ),
     differences.differences(learned, missing=missing),
-    compute.table(runs),
+    compute.table(runs, workers=bool(given.progress)),
 ]
 if params.push:
     made.append(tables.push_split(scores, params.push, missing=missing))
+if given.progress:
+    progress = pd.read_csv(given.progress)
+    made.append(parallel.table(learned, progress, runs, missing=missing))
 for table in made:
     table.write(Path(snakemake.output.table[0]).parent)
