@@ -7,16 +7,19 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.special import stdtrit
 
 from safemr.experiment import planning
 from safemr.learning.networks import LOG_STD_MAX, LOG_STD_MIN
+from safemr.report import statistics
 from safemr.report.statistics import difference_interval
 
 ROOT = Path(__file__).resolve().parents[1]
 ALGORITHMS = (ROOT / "docs/algorithms.md").read_text()
 REPRODUCIBILITY = (ROOT / "REPRODUCIBILITY.md").read_text()
+PAIR, FORMS = ("SafeMR", "JointSIS"), ("free", "literal")
 
 
 def text_of(document: str) -> str:
@@ -94,7 +97,7 @@ def test_the_runs_at_published_settings_are_told_as_recorded(name: str, settings
 
 def test_the_literal_loss_is_told_as_recorded() -> None:
     def first_gradient(variant: str) -> float:
-        paths = sorted(ROOT.glob(f"results/variants/runs/*/{variant}/*/progress.csv"))
+        paths = sorted(ROOT.glob(f"results/variants/runs/Pillars-*/{variant}/*/progress.csv"))
         assert len(paths) == 5
         gradients = [column(path, "certificate_grad_sigma") for path in paths]
         starts = [
@@ -167,3 +170,64 @@ def test_limits_of_the_published_bands_are_quoted_with_their_costs() -> None:
         assert f"| {name} | {value} | {cost} |" in ALGORITHMS
     assert "| PPO without constraint | 25.4 | 55.7 |" in ALGORITHMS
     assert not re.search(r"near 25 \|", ALGORITHMS)
+
+
+def test_what_several_processes_learn_and_cost() -> None:
+    said = text_of((ROOT / "docs/pabal.md").read_text())
+    table = pd.read_csv(ROOT / "results/pabal/tables/parallel.csv").set_index("variant")
+    seconds = table["driver_cpu_s"] + table["workers_cpu_s"].fillna(0)
+    sizes = ("2-2-2", "4-4-4")
+    narrow = [round(seconds[f"SafeMR-{size}"] / seconds["SafeMR"], 1) for size in sizes]
+    wide = [round(seconds[f"SafeMR-256-{size}"] / seconds["SafeMR-256"], 1) for size in sizes]
+    assert [round(ratio) for ratio in narrow] == [4, 4]
+    assert wide == [2.5, 3.2]
+    assert "about four times the processor time" in said
+    assert "2.5 to 3.2 times with 256" in said
+    driver = table["driver_cpu_s"]
+    assert all(driver[f"SafeMR-{size}"] > driver["SafeMR"] for size in sizes)
+    shares = [100 * driver[f"SafeMR-256-{size}"] / driver["SafeMR-256"] for size in sizes]
+    assert "with 256 units {:.0f} to {:.0f}% of that".format(*shares) in said
+    assert table["lost_tasks"].sum() == 0
+    assert table["gradient_age_max"].max() <= 8
+    assert "no gradient was older than the bound of 8 steps" in said
+    for name in ("SafeMR", "SafeMR-2-2-2", "SafeMR-4-4-4"):
+        other = name.replace("SafeMR", "SafeMR-256")
+        assert table["return"][other] > table["return"][name]
+        assert table["return_low"][other] < table["return_high"][name]
+    updates, violations = {}, []
+    for path in ROOT.glob("results/pabal/runs/*/*/*/progress.csv"):
+        several = path.parents[1].name.endswith(("2-2-2", "4-4-4"))
+        updates.setdefault(several, set()).add(int(np.nanmax(column(path, "updates"))))
+        steps = column(path, "train_cost_indicator") * column(path, "train_episodes")
+        violations.append(round(float(np.nansum(steps))))
+    assert updates == {True: {19_375}, False: {19_376}}
+    assert "19,375 gradient steps in all runs of several processes, 19,376 in those of one" in said
+    assert f"{min(violations)} to {max(violations)} a run" in said
+
+
+def test_the_aircraft_without_the_bound_and_with_the_literal_loss() -> None:
+    said = text_of((ROOT / "docs/aircraft.md").read_text())
+    scores = pd.read_csv(ROOT / "results/variants/summary/aircraft_scores.csv")
+
+    def of(variant: str, metric: str) -> np.ndarray:
+        return statistics.scores_of(scores, "Aircraft", variant, metric)
+
+    def difference(form: str, metric: str, unit: float = 1.0) -> list[float]:
+        found = difference_interval(*(of(f"{name}-{form}", metric) for name in PAIR))
+        return [unit * value for value in (found.mean, found.low, found.high)]
+
+    assert not any(of(f"{name}-{form}", "sigma").any() for name in PAIR for form in FORMS)
+    mean, low, high = (-value for value in difference("free", "volume_ratio"))
+    assert f"by {mean:.3f} [{high:.3f}, {low:.3f}] of the true volume smaller" in said
+    missed = difference("free", "missed_share", 100)
+    assert "misses {:.1f} [{:.1f}, {:.1f}] points more".format(*missed) in said
+    literal = difference("literal", "volume_ratio")
+    assert "not told apart: {:.3f} [{:.3f}, {:.3f}]".format(*literal) in said
+    volumes = [of(f"{name}-literal", "volume_ratio").mean() for name in PAIR]
+    missed = [100 * of(f"{name}-literal", "missed_share").mean() for name in PAIR]
+    assert "{:.2f} and {:.2f} times the true volume".format(*volumes) in said
+    assert "with {:.0f} and {:.0f} % missed".format(*missed) in said
+    assert sorted(round(100 * of(f"{n}-literal", "collision_share").mean()) for n in PAIR) == [
+        15,
+        16,
+    ]

@@ -16,7 +16,7 @@ from matplotlib.text import Text
 from safemr import files, paper
 from safemr.certificates.point_robot import ROBOT
 from safemr.errors import UserError
-from safemr.experiment import config
+from safemr.experiment import config, planning
 from safemr.paper import Zeta
 from safemr.report import finding, sensitivity, statistics
 from safemr.report.figures import aircraft, certificate, curves, scenes, scores, style
@@ -64,6 +64,16 @@ def test_the_shipped_variants_have_distinct_looks():
     gaps = np.abs(tints[:, None] - tints[None]).sum(-1) + 3 * np.eye(len(names))
     assert gaps.min() > 0.3
     assert len({style.marker(name) for name in names}) == len(names)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_no_two_algorithms_of_a_configuration_look_alike(path: Path):
+    plan = planning.resolve(config.load([CONFIGS / "config.yaml", path]))
+    looks: dict[str, str] = {}
+    for run in plan.runs:
+        if "[" not in run.variant:  # points of the sensitivity grid have looks of their own
+            other = looks.setdefault(str(style.look(run.variant)), run.variant)
+            assert other == run.variant, f"{other} and {run.variant} look alike"
 
 
 def test_the_certificate_check_draws_every_certificate():

@@ -260,6 +260,10 @@ def test_core_minutes_scale_wall_time_by_the_share_of_a_processor():
     # seed 1 had half a processor
     np.testing.assert_allclose(found["minutes"], [(1 + 0.5) / 2, (2 + 2) / 2])
     assert found["step"].tolist() == [10, 20]
+    # what the workers of a run by several processes took comes to it
+    logged = [tidy(wall, "time_wall_s"), tidy({("T", "A", 1): [30.0, 60.0]}, "workers_cpu_s")]
+    found = statistics.core_minutes(pd.concat(logged), runs)
+    np.testing.assert_allclose(found["minutes"], [(1 + 1) / 2, (2 + 3) / 2])
 
 
 def test_missing_runs_are_listed_in_the_expected_order():

@@ -387,15 +387,19 @@ def core_minutes(progress: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
     """Processor minutes that a run had taken at each logged step, averaged over seeds.
 
     The log holds wall time; a run's processor time is spread over it evenly, so that a busy machine
-    does not make an algorithm look slow. runs: the runs table with wall_s and cpu_s. Returns task,
-    variant, step, minutes; runs whose records do not say both times, or log none, have no part.
+    does not make an algorithm look slow. A run by several processes logs its workers' time, which
+    comes to its own. runs: the runs table with wall_s and cpu_s. Returns task, variant, step,
+    minutes; runs whose records do not say both times, or log none, have no part.
     """
     keys = ["task", "variant", "seed"]
     timed = runs[(runs["cpu_s"] > 0) & (runs["wall_s"] > 0)]
     clock = progress[progress["metric"] == "time_wall_s"].merge(
         timed.assign(busy=timed["cpu_s"] / timed["wall_s"])[[*keys, "busy"]], on=keys
     )
-    clock["minutes"] = clock["value"] * clock["busy"] / 60
+    workers = progress[progress["metric"] == "workers_cpu_s"]
+    workers = workers.rename(columns={"value": "workers_s"})[[*keys, "step", "workers_s"]]
+    clock = clock.merge(workers, on=[*keys, "step"], how="left").fillna({"workers_s": 0.0})
+    clock["minutes"] = (clock["value"] * clock["busy"] + clock["workers_s"]) / 60
     return clock.groupby(["task", "variant", "step"], sort=False)["minutes"].mean().reset_index()
 
 

@@ -86,9 +86,20 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
     "SafeMR-replay": ("#228833", _DASH_DOTTED, "8", "SafeMR-replay"),
     "JointSIS-literal": ("#1B1464", _DASH_DOTTED, "<", "JointSIS-literal"),
     "JointSIS-released": ("#66CCEE", _DASH_DOTTED, "d", "JointSIS-released"),
+    "SafeMR-free": ("#332288", _SHORT, "d", "SafeMR-free"),
+    "JointSIS-free": ("#44AA99", _SHORT, "D", "JointSIS-free"),
+    # config/pabal.yaml
+    "SafeMR-2-2-2": ("#0072B2", _DASHED, "s", "SafeMR-2-2-2"),
+    "SafeMR-4-4-4": ("#009E73", _DASH_DOTTED, "^", "SafeMR-4-4-4"),
+    "SafeMR-256": ("#882255", _LONG, "p", "SafeMR-256"),
+    "SafeMR-256-2-2-2": ("#56B4E9", _SHORT, "D", "SafeMR-256-2-2-2"),
+    "SafeMR-256-4-4-4": ("#999933", _DASH_DASHED, "v", "SafeMR-256-4-4-4"),
 }
-# Tol's "muted" colours for variants that nobody planned.
+# For variants that nobody planned: Tol's "muted" colours, lines and markers, by a checksum of the
+# label, the same in every figure.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")
+_OTHER_LINES = (_DASH_DOTTED, _DASHED, _SHORT, _DASH_DASHED)
+_OTHER_MARKERS = "d*<>ph8H"
 
 Look = tuple[str, Any, str]  # colour, line style, marker
 
@@ -99,16 +110,21 @@ INK = "0.25"
 styled = matplotlib.rc_context(cast(Any, RC))  # decorator of every function that builds a figure
 
 
+def _other(variant: str) -> Look:
+    """The look of an unknown name, which few other names share."""
+    rest, tint = divmod(zlib.crc32(variant.encode()), len(_OTHERS))
+    rest, line = divmod(rest, len(_OTHER_LINES))
+    return _OTHERS[tint], _OTHER_LINES[line], _OTHER_MARKERS[rest % len(_OTHER_MARKERS)]
+
+
 def colour(variant: str) -> str:
     """The variant's colour, the same in every figure; unknown names get one by their checksum."""
-    known = _ALGORITHMS.get(variant)
-    return known[0] if known else _OTHERS[zlib.crc32(variant.encode()) % len(_OTHERS)]
+    return _ALGORITHMS.get(variant, _other(variant))[0]
 
 
 def line_style(variant: str) -> Any:
-    """Matplotlib line style of the variant's family (unknown names: dash-dotted)."""
-    known = _ALGORITHMS.get(variant)
-    return known[1] if known else _DASH_DOTTED
+    """Matplotlib line style of the variant's family; unknown names: by their checksum."""
+    return _ALGORITHMS.get(variant, _other(variant))[1]
 
 
 def look(variant: str) -> Look:
@@ -125,9 +141,8 @@ def member_look(index: int) -> Look:
 
 
 def marker(variant: str) -> str:
-    """Matplotlib marker of the variant (unknown names: a thin diamond)."""
-    known = _ALGORITHMS.get(variant)
-    return known[2] if known else "d"
+    """Matplotlib marker of the variant; unknown names: by their checksum."""
+    return _ALGORITHMS.get(variant, _other(variant))[2]
 
 
 def label(variant: str) -> str:
