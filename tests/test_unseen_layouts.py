@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,17 @@ def test_a_record_flies_like_its_policy_and_is_measured_once(record: Path, tmp_p
     again = unseen_layouts.measured_scores(kept, [record], episodes=2, seed=20_000)
     pd.testing.assert_frame_equal(again, scores)
     assert path.stat().st_mtime_ns == before
+
+
+def test_what_was_measured_outlives_the_policy(record: Path, tmp_path: Path) -> None:
+    """A policy that is left out for its size takes no row from the tables."""
+    kept, folder = Measurements(tmp_path), tmp_path / Path(*record.parts[-4:])
+    shutil.copytree(record, folder)
+    before = unseen_layouts.measured_scores(kept, [folder], episodes=1, seed=20_000)
+    (folder / "policy.npz").unlink()
+    after = unseen_layouts.measured_scores(kept, [folder], episodes=1, seed=20_000)
+    pd.testing.assert_frame_equal(after, before)
+    assert unseen_layouts.measured_scores(kept, [folder], episodes=2, seed=20_000).empty
 
 
 def test_the_command_prints_a_line_a_record(

@@ -12,6 +12,7 @@ from pathlib import Path
 import pandas as pd
 
 from safemr.conventions import own_layouts
+from safemr.errors import UserError
 from safemr.experiment.record import Record
 from safemr.measure import evaluate
 from safemr.measure.controllers import SCORE_COLUMNS
@@ -31,16 +32,20 @@ def measured_scores(
 
     own: not all on these, but each on those of its seed (`own_layouts`). Metrics are those of the
     final evaluations (``eval_return``, ...) and ``eval_return_sd``, the standard deviation over
-    layouts. A record without a policy, which is optional, gives no row.
+    layouts. A record without a policy, which is optional, gives what was measured before it was
+    left out, or no row.
     """
     rows = []
     for folder in folders:
         record = Record.open(folder)
-        if not record.has_policy:
+        first = own_layouts(seed, episodes, record.seed) if own else seed
+        try:
+            found = evaluate.measured(measurements, record, episodes=episodes, seed=first)
+        except UserError:
+            if record.has_policy:
+                raise
             print(f"no policy in {folder}")
             continue
-        first = own_layouts(seed, episodes, record.seed) if own else seed
-        found = evaluate.measured(measurements, record, episodes=episodes, seed=first)
         name = (name_of(record.task), record.variant, record.seed)
         rows += [(*name, f"eval_{metric}", value) for metric, value in found.items()]
     return pd.DataFrame(rows, columns=SCORE_COLUMNS)
