@@ -17,8 +17,12 @@ for (const table of document.querySelectorAll("table.sortable")) {
   heads.forEach((head, column) => {
     const button = document.createElement("button");
     button.type = "button";
+    // On paper a head is repeated on the next page, without the buttons in it.
+    const paper = document.createElement("span");
+    paper.className = "paper";
+    paper.textContent = head.textContent;
     button.append(...head.childNodes);
-    head.append(button);
+    head.append(button, paper);
     button.addEventListener("click", () => {
       const order = next[head.getAttribute("aria-sort") || "none"];
       heads.forEach((other) => other.removeAttribute("aria-sort"));
@@ -57,6 +61,6 @@ for (const film of document.querySelectorAll("picture")) {
   show();
 }
 
-// What is folded is open on paper.
-const folded = document.querySelectorAll("details");
+// What is folded is open on paper, but for lists of links.
+const folded = document.querySelectorAll("details:not(.runs details)");
 addEventListener("beforeprint", () => folded.forEach((part) => part.setAttribute("open", "")));
