@@ -157,6 +157,17 @@ def test_a_record_that_came_after_the_plan_is_kept(checkout: Checkout) -> None:
     assert "train" not in checkout.scheduled()
 
 
+def test_a_record_of_an_outside_program_that_came_after_the_plan_is_kept(
+    checkout: Checkout,
+) -> None:
+    checkout.configure(outside={"CEM": {"algorithm": "cross_entropy", "steps": 4000}})
+    checkout.fill_in_records()
+    record = checkout.folder / "results" / checkout.plan().outside[0].path
+    before = {path.name: path.read_bytes() for path in record.iterdir()}
+    checkout.snakemake("--force", str((record / records.PROGRESS).relative_to(checkout.folder)))
+    assert {path.name: path.read_bytes() for path in record.iterdir()} == before
+
+
 def test_what_is_recorded_can_be_drawn_without_training(checkout: Checkout) -> None:
     allow = ("--config", "allow_missing=true")
     assert "none of the configured runs" in checkout.snakemake("-n", "all", *allow, check=False)
