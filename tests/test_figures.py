@@ -263,6 +263,7 @@ def figures(progress: pd.DataFrame) -> dict[str, Callable[[], Figure]]:
             {"phi_h": paper.PHI_H, "phi_0": paper.PHI_0}, D_MIN, margins, "phi_h"
         ),
         "multiplier": lambda: certificate.multiplier_maps({"t": plane}, ["t", "absent"]),
+        "multiplier of one task": lambda: certificate.multiplier_maps({"t": plane}, ["t"]),
     }  # fmt: skip
 
 
@@ -279,8 +280,12 @@ def test_figures_are_vector_and_pixels_at_print_width(progress, tmp_path, name):
     assert b"CreationDate" not in content
     width, _ = struct.unpack(">II", png.read_bytes()[16:24])
     assert width == pytest.approx(300 * figure.get_figwidth(), abs=1)
-    sizes = {text.get_fontsize() for text in figure.findobj(Text) if text.get_text()}
-    assert sizes <= {style.LETTERS, style.SMALL}
+    written = [text for text in figure.findobj(Text) if text.get_text()]
+    assert {text.get_fontsize() for text in written} <= {style.LETTERS, style.SMALL}
+    figure.canvas.draw()  # at its own resolution again
+    drawn = figure.get_tightbbox()
+    assert drawn.x0 >= -0.02, "cut off at the left"
+    assert drawn.x1 <= figure.get_figwidth() + 0.02, "cut off at the right"
 
 
 def test_saving_twice_gives_equal_files(progress, tmp_path):

@@ -117,7 +117,7 @@ def slices(x: Array, y: Array, cuts: Sequence[Slice], d_min: float) -> Figure:
         ax.set_xlabel("$x$ ahead (m)")
     for ax in axes[:, 0]:
         ax.set_ylabel("$y$ left (m)")
-    figure.legend(handles=_handles(cuts[0]), loc="outside lower center", ncols=4)
+    style.legend_below(figure, _handles(cuts[0]), 4)
     return figure
 
 
@@ -205,7 +205,7 @@ def frontier(
         Line2D([], [], color="k", marker="1", ls="none", ms=6, mew=1.2, label="learners' start"),
         Patch(fc="#009E73", alpha=0.4, label=f"covers ({100 * covers:g}% missed or less)"),
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    style.legend_below(figure, handles, 2)
     return figure
 
 
@@ -244,5 +244,5 @@ def neural(
         ),
         *_handles(replace(cut, learned={})),
     ]  # fmt: skip
-    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    style.legend_below(figure, handles, 4)
     return figure

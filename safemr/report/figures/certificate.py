@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, TwoSlopeNorm
 from matplotlib.figure import Figure
@@ -323,14 +324,14 @@ def multiplier_maps(scenes: Mapping[str, Mapping[str, NDArray]], names: Sequence
             image, ax=list(axes), pad=0.01, shrink=0.8, label=r"multiplier $\lambda(s)$"
         )
     axes[0].set_ylabel("$y$ (m)")
-    handles = {
-        r"$\phi = 0$": Line2D([], [], color="#0072B2", lw=1.3),
-        r"$d = d_{\min}$": Line2D([], [], color="k", ls=":", lw=0.8),
-        "obstacle": Patch(fc="0.35", ec="none"),
-        "goal": Line2D([], [], color="#009E73", marker="o", mfc="none", ls="none"),
-        "motion": Line2D([], [], color="k", marker=r"$\rightarrow$", ls="none", ms=8),
-    }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+    handles: list[Artist] = [
+        Line2D([], [], color="#0072B2", lw=1.3, label=r"$\phi = 0$"),
+        Line2D([], [], color="k", ls=":", lw=0.8, label=r"$d = d_{\min}$"),
+        Patch(fc="0.35", ec="none", label="obstacle"),
+        Line2D([], [], color="#009E73", marker="o", mfc="none", ls="none", label="goal"),
+        Line2D([], [], color="k", marker=r"$\rightarrow$", ls="none", ms=8, label="motion"),
+    ]
+    style.legend_below(figure, handles, len(handles))
     return figure
 
 

@@ -219,7 +219,7 @@ def sensitivity(
     handles = [
         style.line_entry(looks[v], names[v] + " (no record)" * (v not in drawn)) for v in wanted
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=2)
+    style.legend_below(figure, handles, 2)
     return figure
 
 
@@ -281,7 +281,7 @@ def parameter_evolution(
     scale = f"scale: linear to $\\pm${linear:g}, then logarithmic"
     handles.append(Line2D([], [], ls="none", label=scale))
     columns = min(len(handles), 3)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    style.legend_below(figure, handles, columns)
     return figure
 
 
@@ -362,4 +362,4 @@ def _seed_lines(runs: pd.DataFrame, ax: Axes, variant: str, written: bool) -> No
 def _legend(figure: Figure, variants: Sequence[str]) -> None:
     handles = [style.line_entry(style.look(v), style.label(v)) for v in variants]
     columns = style.legend_columns(variants)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    style.legend_below(figure, handles, columns)

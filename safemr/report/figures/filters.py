@@ -87,5 +87,5 @@ def behind_filters(flown: pd.DataFrame) -> Figure:
                    mew=1.2 * (marker == "|"), label=text)
         )  # fmt: skip
     columns = style.legend_columns(filters)
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    style.legend_below(figure, handles, columns)
     return figure

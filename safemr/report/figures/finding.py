@@ -161,7 +161,7 @@ def finding(
         handles += style.marks(variants)
     names = [*(str(handle.get_label()) for handle in handles)]
     ncols = style.legend_columns(names) if not named else 4 if width > style.COLUMN_WIDTH else 1
-    figure.legend(handles=handles, loc="outside lower center", ncols=ncols)
+    style.legend_below(figure, handles, ncols)
     if where:
         figure.suptitle(where)
     if named:

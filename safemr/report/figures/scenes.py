@@ -271,7 +271,7 @@ def _scene_legend(
         width = figure.get_figwidth() / style.TEXT_WIDTH
         longest = max(map(len, found)) + 7
         columns = max(1, min(len(found), int(110 * width / longest)))
-        figure.legend(handles=list(found.values()), loc="outside lower center", ncols=columns)
+        style.legend_below(figure, list(found.values()), columns)
 
 
 @style.styled

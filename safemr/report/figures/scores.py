@@ -132,7 +132,7 @@ def return_against_cost(
     handles.append(Line2D([], [], **look, mfc="none", mew=1.1, label=f"mean, {hollow_means}"))
     handles.append(Line2D([], [], **{**look, "ms": 2.6}, label="one seed"))
     columns = style.legend_columns([str(handle.get_label()) for handle in handles])
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    style.legend_below(figure, handles, columns)
     return figure
 
 
@@ -211,7 +211,7 @@ def aggregate_scores(
     ]
     if handles:
         columns = style.legend_columns(aggregates.profiles)
-        figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+        style.legend_below(figure, handles, columns)
     return figure
 
 

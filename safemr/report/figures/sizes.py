@@ -59,5 +59,5 @@ def against_size(
                label="not feasible")
     )  # fmt: skip
     columns = style.legend_columns([*variants, "oracle", "not feasible"])
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+    style.legend_below(figure, handles, columns)
     return figure

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import matplotlib
 import numpy as np
 import pandas as pd
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -169,6 +171,16 @@ def legend_columns(variants: Iterable[str]) -> int:
     """As many columns as the longest name leaves room for: what does not fit would be cut off."""
     lengths = [len(variant) for variant in variants]
     return max(1, min(len(lengths), 8, 96 // (max(lengths, default=1) + 5)))
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist], columns: int) -> Legend:
+    """A legend under all panels in so many columns, or in fewer where it would be cut off."""
+    while True:
+        legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+        if columns <= 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return legend
+        legend.remove()
+        columns -= 1
 
 
 def new_figure(width: float, height: float) -> Figure:
