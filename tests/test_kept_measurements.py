@@ -206,7 +206,9 @@ TOLERANCE: Mapping[str, Mapping[str, float]] = {
         # The control is trained by what is measured, for thousands of steps.
         r"\[\d+\]/(collisions|\w*share\w*|effort.*|least_separation|volume.*|iou)": 0.02,
     },
-    "aircraft_neural_slice": {"/learned/.*": 1e-4},
+    # Half precision: one step of it at 1.
+    "aircraft_slices": {"/.*": 1e-3},
+    "aircraft_neural_slice": {"/.*": 1e-3},
     "rollouts": {"/map/(multiplier|phi)": 1e-4},
 }  # fmt: skip
 

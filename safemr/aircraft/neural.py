@@ -23,7 +23,7 @@ from safemr.aircraft import reachability, scoring, unsafe_sets
 from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
 from safemr.aircraft.scoring import CONTROL, TrueSets, learners
-from safemr.aircraft.slices import Slice
+from safemr.aircraft.slices import Slice, near_boundary
 from safemr.aircraft.unsafe_sets import Energy, Truth, of_states
 from safemr.algorithms.neural_safemr import NeuralCertificate, neural_energy
 from safemr.certificates.families import PAPER, named
@@ -203,7 +203,8 @@ def measured(
         shown = {variant: found[:1] for variant, found in energies.items()}
         _, _, cut = slice_at(sets.constant, shown)
         learned = {f"learned/{name}": found[0] for name, found in cut.learned.items()}
-        return {"truth": cut.truth, "handcrafted": cut.handcrafted, **learned}
+        found = {"truth": cut.truth, "handcrafted": cut.handcrafted, **learned}
+        return {name: near_boundary(values) for name, values in found.items()}
 
     comparison = pd.DataFrame(measurements.rows("aircraft_neural", "neural", inputs, rows))
     kept = measurements.arrays("aircraft_neural_slice", "neural", inputs, arrays)

@@ -26,7 +26,7 @@ from safemr import paper
 from safemr.aircraft import reachability, unsafe_sets
 from safemr.aircraft.reachability import Solution
 from safemr.aircraft.reachability.grid import Floats
-from safemr.aircraft.slices import Slice
+from safemr.aircraft.slices import Slice, near_boundary
 from safemr.aircraft.unsafe_sets import Truth
 from safemr.certificates.certificate import Certificate, EnergyCertificate
 from safemr.certificates.energy import constraint
@@ -266,7 +266,7 @@ def slices(
     """x [X], y [Y] over the box where encounters start, and all unsafe sets at each psi.
 
     The learned ones are those of all variants but the ``handcrafted``; every set contains the disc.
-    The solved values are kept among ``measurements``.
+    The solved values are kept among ``measurements`` (`near_boundary`).
     """
     dynamics = sets.dynamics
     label, own = sets.kept_as("slices")
@@ -280,7 +280,7 @@ def slices(
         label,
         {"degrees": list(degrees), "spacing": spacing, "solver": reachability.VERSION, **own},
         lambda: {
-            name: np.stack([solution(states) for states in planes]).astype(np.float32)
+            name: near_boundary(np.stack([solution(states) for states in planes]))
             for name, solution in (("truth", sets.constant), ("adversarial", sets.adversarial))
         },
     )

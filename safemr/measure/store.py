@@ -41,11 +41,11 @@ VERSIONS = {
     "unseen_layouts": 1,
     "filters": 1,
     "aircraft_frontier": 1,
-    "aircraft_slices": 1,
+    "aircraft_slices": 2,
     "aircraft_learners": 1,
     "aircraft_references": 1,
     "aircraft_neural": 1,
-    "aircraft_neural_slice": 1,
+    "aircraft_neural_slice": 2,
 }
 
 T = TypeVar("T")
