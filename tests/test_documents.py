@@ -86,7 +86,7 @@ def test_the_runs_at_limit_25_are_told_as_recorded(name: str) -> None:
 @pytest.mark.parametrize("name", ["PPO-L", "TRPO-L", "CPO"])
 @pytest.mark.parametrize("settings", ["published", "grid"])
 def test_the_runs_at_published_settings_are_told_as_recorded(name: str, settings: str) -> None:
-    root, last = ("published", 240e3) if settings == "published" else ("pilot", 256e3)
+    root, last = ("published", 240e3) if settings == "published" else ("probes", 256e3)
     path = only(f"{root}/runs/Pillars-0.15-Goal/{name}/seed100-*")
     edges = (56e3, 104e3, 152e3, 200e3, last)
     for cell, low, high in zip(cells(ALGORITHMS, name, settings), edges, edges[1:], strict=False):

@@ -45,7 +45,7 @@ def started(
 
 def test_it_stands_beside_the_papers_tasks_not_among_them() -> None:
     assert POINT_GOAL.name not in NAVIGATION_TASKS
-    for file in ("config", "quick", "pilot", "smoke"):
+    for file in ("config", "quick", "second_pilot", "smoke"):
         assert "PointGoal" not in str(load(["config/config.yaml", f"config/{file}.yaml"]))
 
 

@@ -1,8 +1,8 @@
 """``safemr progress``: how far the runs of a configuration are, on one screen.
 
-safemr progress                                       the paper's grid, once
-safemr progress --configfile config/pilot.yaml        another configuration, as for make.py
-safemr progress --watch                               again every 5 seconds, until all is recorded
+safemr progress                                        the paper's grid, once
+safemr progress --configfile config/second_pilot.yaml  another configuration, as for make.py
+safemr progress --watch                                again every 5 seconds, until all is recorded
 """
 
 from __future__ import annotations
