@@ -2,6 +2,7 @@
 
     python -m benchmarks.peers [--parts epochs updates learning] [--cases 'SafeMR*' ...]
         [--omnisafe-python PATH] [--sb3-python PATH] [--output FILE.csv]
+    python -m benchmarks.peers --show FILE.csv ...
 
 epochs: PPO-Lagrangian of OmniSafe on SafetyPointGoal1 against ours on PointGoal1, with the same
 networks, epochs, minibatches and passes, all of which are made (one case apart). CPU ms for 1,000
@@ -26,7 +27,8 @@ gradient step.
 Blocks of epochs and updates take turns over all cases and tables show medians over them, so that
 other users of the machine disturb all alike; the first block of each is not counted. The others'
 packages are no dependencies: each has an environment of its own, made by the commands at the head
-of benchmarks/peers_omnisafe.txt and benchmarks/peers_sb3.txt.
+of benchmarks/peers_omnisafe.txt and benchmarks/peers_sb3.txt. What docs/speed.md tells is in
+benchmarks/measured; --show prints the tables of such files.
 """
 
 from __future__ import annotations
@@ -168,6 +170,11 @@ def described(
     ]
 
 
+def number(value: float) -> str:
+    """Four digits that count."""
+    return f"{float(f'{value:.4g}'):,.0f}" if abs(value) >= 1_000 else f"{value:.4g}"
+
+
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     """A table a part: cases down, quantities across."""
     lines: list[str] = []
@@ -181,7 +188,7 @@ def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
         lines += ["", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
         for (case, seed), values in cases.items():
             label = f"{case}, seed {seed}" if seed else case
-            cells = [f"{values[name]:.4g}" if name in values else "-" for name in quantities]
+            cells = [number(values[name]) if name in values else "-" for name in quantities]
             lines.append("| " + " | ".join((label, *cells)) + " |")
     return "\n".join(lines)
 
@@ -191,6 +198,19 @@ def write(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
+
+
+def measured(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """The rows of files that `write` wrote, one after the other. Raises UserError for others."""
+    rows: list[dict[str, Any]] = []
+    for path in paths:
+        try:
+            with path.open(newline="") as file:
+                found = list(csv.DictReader(file))
+            rows += [{**row, "value": float(row["value"])} for row in found]
+        except (OSError, KeyError, ValueError) as error:
+            raise UserError(f"--show: {path} is no file of this program's ({error})") from None
+    return rows
 
 
 def selected(cases: Sequence[Case], patterns: Sequence[str]) -> list[Case]:
@@ -222,11 +242,15 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--max-steps", type=int, default=SCHEDULED, help="of a training run")
     parser.add_argument("--max-minutes", type=float, default=15.0, help="its CPU minutes")
     parser.add_argument("--output", type=Path, help="write the rows as CSV, too")
+    parser.add_argument("--show", type=Path, nargs="+", help="no measurement: tables of files")
     return parser.parse_args(arguments)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     options = parsed(arguments)
+    if options.show:
+        print(markdown(measured(options.show)))
+        return 0
     torch.set_num_threads(1)
     made = {
         "epochs": epoch_cases(options.omnisafe_python, options.epoch_steps),

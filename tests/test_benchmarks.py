@@ -151,3 +151,20 @@ def test_what_was_measured_is_written(tmp_path: Path) -> None:
     assert row["versions"] == "torch=2 numpy=3"
     assert row["cpu"]
     assert row["date"][:2] == "20"
+    assert peers.measured([tmp_path / "rows.csv"]) == [{**row, "value": 0.33333}]
+
+
+@pytest.mark.parametrize("part", peers.PARTS)
+def test_the_tables_of_what_was_measured_are_the_programs(
+    part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = ROOT / "benchmarks/measured"
+    assert peers.main(["--show", str(kept / f"peers_{part}.csv")]) == 0
+    assert capsys.readouterr().out.strip() == (kept / f"peers_{part}.md").read_text().strip()
+
+
+def test_what_is_no_file_of_measurements_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    for name in ("other.csv", "missing.csv"):
+        with pytest.raises(UserError, match=f"--show: .*{name} is no file of this program's"):
+            peers.main(["--show", str(tmp_path / name)])

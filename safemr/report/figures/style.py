@@ -67,6 +67,9 @@ _LONG, _SHORT, _DASH_DASHED, _SPARSE = (
     (0, (6, 1.2, 2, 1.2)),
     (0, (1, 2.4)),
 )
+_WARM, _COLD = ("#D55E00", "#AA3377", "#CCBB44"), ("#0072B2", "#1B1464", "#66CCEE")
+_FORMS = {"": _SOLID, "literal": _DASH_DOTTED, "released": _DASHED}  # "": floored
+_TRAVELS = {"0.1": "v", "0.33": "p", "1": "^", "3.3": ">"}
 _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, marker, mathtext
     "SafeMR": ("#D55E00", _SOLID, "o", "SafeMR"),
     "JointSIS": ("#0072B2", _LONG, "s", "JointSIS"),
@@ -97,6 +100,12 @@ _ALGORITHMS: dict[str, tuple[str, Any, str, str]] = {  # label -> colour, line, 
     "SafeMR-256-2-2-2": ("#56B4E9", _SHORT, "D", "SafeMR-256-2-2-2"),
     "SafeMR-256-4-4-4": ("#999933", _DASH_DASHED, "v", "SafeMR-256-4-4-4"),
 }
+# config/forms_tuning.yaml: colour for algorithm and form, line for the form, marker for the travel.
+for _base, _tints in (("SafeMR", _WARM), ("JointSIS", _COLD)):
+    for (_form, _line), _tint in zip(_FORMS.items(), _tints, strict=True):
+        for _travel, _marker in _TRAVELS.items():
+            _name = "-".join(part for part in (_base, _form, _travel) if part)
+            _ALGORITHMS[_name] = (_tint, _line, _marker, _name)
 # For variants that nobody planned: Tol's "muted" colours, lines and markers, by a checksum of the
 # label, the same in every figure.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")
