@@ -133,7 +133,25 @@ def digest(tree: Path) -> str:
     """The digest that the next process would compute."""
     for function in (sources._direct, sources._modules, sources._beside, sources._file_digest):
         function.cache_clear()
-    return sources.digest(tree / "script.py")
+    script, kept = tree / "script.py", tree.parent / "kept.json"
+    remembered = sources.digests([script], kept)["script"]
+    kept.unlink()
+    assert sources.digests([script], kept)["script"] == remembered
+    return remembered
+
+
+def test_what_is_remembered_is_not_read_again(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = digest(tree)
+    kept = tree.parent / "kept.json"
+    monkeypatch.setattr(sources, "reached", None)
+    assert sources.digests([tree / "script.py"], kept) == {"script": before}
+
+
+@pytest.mark.parametrize("damage", ["", "[]", '{"key": 1}', '{"reached": []}'])
+def test_a_damaged_memory_is_no_harm(damage: str, tree: Path) -> None:
+    before = digest(tree)
+    (tree.parent / "kept.json").write_text(damage)
+    assert digest(tree) == before
 
 
 def test_every_way_to_use_a_file_is_followed(tree: Path) -> None:

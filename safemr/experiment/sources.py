@@ -1,9 +1,9 @@
 """What a script's result depends on beside its inputs: the sources it uses, as one digest.
 
 Snakemake notices that a script was edited, but not what the script imports. Every rule that draws,
-measures or aggregates therefore has `digest` of its script among its parameters, so that an edit
-in ``safemr/`` or ``envs/`` makes again what depends on it, and nothing else. The training rule has
-none: a run is identified by its settings and the versions in them.
+measures or aggregates therefore has a digest of all that (`digests`) among its parameters, so that
+an edit in ``safemr/`` or ``envs/`` makes again what depends on it, and nothing else. The training
+rule has none: a run is identified by its settings and the versions in them.
 
 Nothing is imported to find out; the syntax trees say what is reached:
 
@@ -19,16 +19,19 @@ file that once made it, says what was trained. Other packages count with their i
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import hashlib
+import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
 from safemr.files import REPOSITORY as ROOT
+from safemr.files import write
 
 PACKAGES = ("envs", "safemr")
 # Import name -> distributions, where they differ, and what is drawn with beneath matplotlib.
@@ -50,12 +53,46 @@ class Uses:
     distributions: frozenset[str]
 
 
-def digest(script: Path | str) -> str:
-    """16 hexadecimal digits that change when the script, or anything it reaches, changes.
+def digests(scripts: Sequence[Path], kept: Path) -> dict[str, str]:
+    """Name of each script -> 16 hexadecimal digits that change when it, or what it reaches, does.
 
-    Raises OSError where a source cannot be read.
+    What scripts reach is remembered in the file ``kept``, for these very sources only, because
+    reading all syntax trees takes a second. Raises OSError where a source cannot be read.
     """
-    found = reached(script)
+    key = _key(scripts)
+    try:
+        saved = json.loads(kept.read_text())
+        found = {} if saved["key"] != key else {
+            Path(name): Uses(frozenset(ROOT / file for file in files), frozenset(distributions))
+            for name, (files, distributions) in saved["reached"].items()
+        }  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        found = {}  # absent, damaged or of another version: read the sources again
+    if found.keys() != set(scripts):
+        found = {script: reached(script) for script in scripts}
+        entries = {
+            str(script): (sorted(map(_name, uses.files)), sorted(uses.distributions))
+            for script, uses in found.items()
+        }
+        with contextlib.suppress(OSError):  # only slower the next time
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            text = json.dumps({"key": key, "reached": entries})
+            write(kept, text.encode(), durable=False)
+    return {script.stem: _digest(uses) for script, uses in found.items()}
+
+
+def _key(scripts: Sequence[Path]) -> str:
+    """Of all files that scripts can reach, by name and content, and of who reads them."""
+    within = [ROOT / name for name in PACKAGES] + sorted({script.parent for script in scripts})
+    state = hashlib.sha256(f"{sys.version} {scripts}".encode())
+    for folder in within:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                state.update(f"{path}:{_file_digest(path)}\n".encode())
+    return state.hexdigest()
+
+
+def _digest(found: Uses) -> str:
     state = hashlib.sha256()
     for path in sorted(found.files):
         state.update(f"{_name(path)}:{_file_digest(path)}\n".encode())

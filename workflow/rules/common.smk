@@ -2,6 +2,7 @@
 import os
 import re
 import sys
+from pathlib import Path
 
 # Said before anything runs: Snakemake calls the interpreter of a script without quotes, and
 # PYTHONPATH is split at colons.
@@ -29,7 +30,7 @@ from safemr.errors import UserError
 from safemr.experiment.records import POLICY, PROVENANCE, REQUIRED_FILES
 from safemr.experiment.plan_cache import plan_for
 from safemr import paper
-from safemr.experiment.sources import digest
+from safemr.experiment.sources import digests
 
 # A file given by --configfile replaces whole top-level keys of the default, so that it can also
 # leave something out; Snakemake's own `configfile:` would merge the two entry by entry.
@@ -47,6 +48,10 @@ except UserError as error:
 
 RESULTS, FIGURES = CONFIG.results_root.as_posix(), CONFIG.figures_root.as_posix()
 RUNS = {run.path.as_posix(): run for run in PLAN.runs}
+SOURCES = digests(
+    sorted(Path(workflow.basedir, "workflow/scripts").glob("*.py")),
+    Path(RESULTS, ".work/sources.json"),
+)
 SUMMARY = f"{RESULTS}/summary"
 LOGS = f"{RESULTS}/logs"
 # By their roles, whatever their labels: the variant that Table I is about, and the one without its
@@ -96,7 +101,7 @@ def one_of(names):
 
 def sources(script):
     """A digest of what workflow/scripts/<script>.py uses: an edit there runs its rule again."""
-    return digest(os.path.join(workflow.basedir, f"workflow/scripts/{script}.py"))
+    return SOURCES[script]
 
 
 def without_policy(runs):
