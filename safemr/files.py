@@ -65,16 +65,20 @@ def load_arrays(path: Path | str) -> Arrays:
         raise UserError(f"{path} is not a readable archive of arrays: {error}") from error
 
 
+class NoPolicyError(UserError):
+    """A record has no policy file, which is optional."""
+
+
 def policy_arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a ``policy.npz``. Pickled objects, which could run code, are refused.
 
-    Raises UserError where there is no such file, or none that can be read.
+    Raises NoPolicyError where there is no such file, and UserError where it cannot be read.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
-        raise UserError(f"{path}: no such policy; train the run first") from error
+        raise NoPolicyError(f"{path}: no such policy; train the run first") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"{path} is not a readable policy file: {error}") from error
 

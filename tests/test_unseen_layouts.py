@@ -76,6 +76,10 @@ def test_what_was_measured_outlives_the_policy(record: Path, tmp_path: Path) -> 
     after = unseen_layouts.measured_scores(kept, [folder], episodes=1, seed=20_000)
     pd.testing.assert_frame_equal(after, before)
     assert unseen_layouts.measured_scores(kept, [folder], episodes=2, seed=20_000).empty
+    (path,) = (tmp_path / "measurements/unseen_layouts").iterdir()
+    path.write_text(path.read_text().replace("return", "retrun"))
+    with pytest.raises(UserError, match="is damaged"):
+        unseen_layouts.measured_scores(kept, [folder], episodes=1, seed=20_000)
 
 
 def test_the_command_prints_a_line_a_record(

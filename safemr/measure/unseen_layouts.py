@@ -12,8 +12,8 @@ from pathlib import Path
 import pandas as pd
 
 from safemr.conventions import own_layouts
-from safemr.errors import UserError
 from safemr.experiment.record import Record
+from safemr.files import NoPolicyError
 from safemr.measure import evaluate
 from safemr.measure.controllers import SCORE_COLUMNS
 from safemr.measure.store import Measurements
@@ -41,9 +41,7 @@ def measured_scores(
         first = own_layouts(seed, episodes, record.seed) if own else seed
         try:
             found = evaluate.measured(measurements, record, episodes=episodes, seed=first)
-        except UserError:
-            if record.has_policy:
-                raise
+        except NoPolicyError:
             print(f"no policy in {folder}")
             continue
         name = (name_of(record.task), record.variant, record.seed)
