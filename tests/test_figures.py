@@ -180,7 +180,7 @@ def variations(names: list[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def test_many_variants_of_one_task_are_told_apart():
-    names = ["SafeMR", *(f"SafeMR-{i}" for i in range(6)), "PPO-L", "PPO-L-1", "CPO"]
+    names = ["SafeMR", *(f"SafeMR-v{i}" for i in range(6)), "PPO-L", "PPO-L-v1", "CPO"]
     figure = curves.compute_curves(*variations(names), TASKS[:1])
     assert [ax.get_title().split(", ")[1] for ax in figure.axes] == ["SafeMR", "PPO-L", "CPO"]
     for ax, members in zip(figure.axes, (names[:7], names[7:9], names[9:]), strict=True):
