@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 import yaml
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 
 from envs.aircraft import AircraftVectorEnv
 from safemr.aircraft import scoring, unsafe_sets
@@ -249,6 +249,30 @@ def test_figures_draw_the_boundaries_they_are_given(tmp_path: Path) -> None:
     pdf, png = style.save(figure, tmp_path / "slices")
     assert pdf.read_bytes().startswith(b"%PDF")
     assert png.stat().st_size > 10_000
+
+
+def test_each_of_several_coinciding_boundaries_is_seen() -> None:
+    """None hides another, and no two have the same line."""
+    x, y = np.arange(-6, 6.01, 0.25), np.arange(-5, 5.01, 0.25)
+    radius = np.hypot(*np.meshgrid(x, y, indexing="ij"))
+    names = ["SafeMR", "JointSIS", "SafeMR-free", "JointSIS-free", "SafeMR-literal"]
+    learned = {name: [4.0 - radius] for name in names}
+    cut = pictures.Slice(0.0, radius - 2.0, 1.5 - radius, learned)
+    figure = pictures.slices(x, y, [cut], d_min=1.0)
+    (legend,) = figure.legends
+    named = [line for line in legend.get_lines() if line.get_label() in names]
+    assert len(named) == len({line.get_color() for line in named}) == len(names)
+    figure.set_dpi(200)
+    figure.canvas.draw()
+    seen = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    (ax,) = figure.axes
+    box = ax.get_window_extent()
+    inside = seen[int(len(seen) - box.y1) : int(len(seen) - box.y0), int(box.x0) : int(box.x1)]
+    shown = {
+        name: int((np.abs(inside - np.array(to_rgb(style.colour(name))) * 255) < 12).all(-1).sum())
+        for name in names
+    }
+    assert min(shown.values()) > 0.5 * sum(shown.values()) / len(names), shown
 
 
 def test_frontier_figure_shows_every_run_once(comparison: pd.DataFrame) -> None:

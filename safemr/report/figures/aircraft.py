@@ -24,6 +24,7 @@ from safemr.report.figures import style
 Array = NDArray[np.float64]
 
 TRUE = "#B2182B"  # the paper draws the true boundary in red
+_PERIOD = 9.0  # of learners' dashes, in line widths
 _HANDCRAFTED, _HANDCRAFTED_LABEL = "FAC-phih", r"handcrafted $\phi_h$"
 # The left half of an aircraft's outline, nose at the right, one unit long.
 _OUTLINE_X = (0.5, 0.42, 0.12, -0.12, -0.22, -0.1, -0.34, -0.43, -0.5, -0.46)
@@ -56,7 +57,7 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     handcrafted = style.steady(cut.handcrafted)
     ax.contour(x, y, handcrafted.T, levels=[0], colors=[style.colour(_HANDCRAFTED)],
                linewidths=1.2, linestyles=[(0, (1.5, 1))], zorder=5)  # fmt: skip
-    for variant in reversed(style.ordered(cut.learned)):
+    for variant in _drawn(cut):
         tint, runs = style.colour(variant), style.steady(np.stack(cut.learned[variant]))
         disputed = np.minimum(runs.max(0), -runs.min(0))  # > 0: unsafe by some, but not by all
         if disputed.max() > 0:
@@ -71,9 +72,16 @@ def draw_slice(ax: Axes, x: Array, y: Array, cut: Slice, d_min: float) -> Axes:
     return ax
 
 
+def _drawn(cut: Slice) -> list[str]:
+    """The learners, the method first: the solid line lies below what has gaps."""
+    return sorted(style.ordered(cut.learned), key=lambda variant: variant != cut.method)
+
+
 def _dash(variant: str, cut: Slice) -> object:
-    """The learners' boundaries often coincide: the rival's dashes let the method's line through."""
-    return "-" if variant == cut.method else (0, (5, 2.5))
+    """Boundaries often coincide: all dashes begin together, and each ends before that below it."""
+    drawn = _drawn(cut)
+    off = _PERIOD * drawn.index(variant) / len(drawn)
+    return (0, (_PERIOD - off, off)) if off else "-"
 
 
 def _handles(cut: Slice) -> list[Line2D | Patch]:
@@ -82,7 +90,7 @@ def _handles(cut: Slice) -> list[Line2D | Patch]:
         *(
             Line2D([], [], color=style.colour(v), ls=_dash(v, cut), lw=1.2,
                    label=style.label(v) + ", median" * (len(cut.learned[v]) > 1))
-            for v in style.ordered(cut.learned)
+            for v in _drawn(cut)
         ),
         Line2D([], [], color=style.colour(_HANDCRAFTED), ls=(0, (1.5, 1)), lw=1.2,
                label=_HANDCRAFTED_LABEL),
