@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -196,6 +197,23 @@ def test_every_claim_of_the_first_protocol_is_one_of_the_second():
     assert {PRIMARY, "unsafe[PPO-L]", "sensitivity_cost"} <= other
     with pytest.raises(TypeError, match="RateRule"):
         second[3].judge(Evidence(grid(), pd.DataFrame(), tasks=(TASK,), rule=tables.SafetyRule()))
+
+
+def test_what_flights_decide_is_not_shown_by_curves_of_evaluations():
+    for claim in claims.claims(protocol=2):
+        if "flown" in claim.measure or "unseen" in claim.measure:
+            assert claim.figure != "training_curves", claim.name
+
+
+@pytest.mark.parametrize("path", sorted(Path("config").glob("*.yaml")), ids=lambda path: path.stem)
+def test_recorded_differences_say_what_was_compared(path):
+    loaded = config.load(["config/config.yaml", path])
+    table = Path(loaded.results_root) / "tables/differences.md"
+    if not table.exists():
+        pytest.skip("not drawn")
+    (caption, _) = table.read_text().split("\n", 1)
+    assert ("unseen layouts" in caption) == (loaded.protocol == 2)
+    assert ("final evaluations" in caption) == (loaded.protocol == 1)
 
 
 def test_points_are_safe_by_their_rates():

@@ -38,7 +38,7 @@ from safemr.report.findings import (
     surely_below,
     unavailable,
 )
-from safemr.report.second_protocol import judgements
+from safemr.report.second_protocol import Judgement, judgements
 from safemr.report.statistics import Estimate
 from safemr.report.tables import Table, best_safe_baseline
 
@@ -292,12 +292,13 @@ def claims(tasks: Sequence[str] = paper.TASKS, protocol: int = 1) -> list[Claim]
     if protocol == 1:
         return listed
     others = judgements(tuple(tasks))
-    return [
-        replace(claim, measure=others[claim.name].measure, judge=others[claim.name].judge)
-        if claim.name in others
-        else claim
-        for claim in listed
-    ]
+    return [_judged_otherwise(claim, others.get(claim.name)) for claim in listed]
+
+
+def _judged_otherwise(claim: Claim, by: Judgement | None) -> Claim:
+    if by is None:
+        return claim
+    return replace(claim, measure=by.measure, judge=by.judge, figure=by.figure or claim.figure)
 
 
 def _first_protocol(tasks: Sequence[str]) -> list[Claim]:

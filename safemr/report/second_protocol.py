@@ -139,10 +139,11 @@ def rule_of(protocol: int, tolerance: float, clean_share: float) -> SafetyRule:
 
 
 class Judgement(NamedTuple):
-    """What the second protocol measures of a claim, and its rule."""
+    """What the second protocol measures of a claim, its rule, and the figure that shows it."""
 
     measure: str
     judge: Callable[[Evidence], Finding]
+    figure: str | None = None  # where it is another than the first protocol's
 
 
 def judgements(tasks: tuple[str, ...]) -> Mapping[str, Judgement]:
@@ -154,10 +155,11 @@ def judgements(tasks: tuple[str, ...]) -> Mapping[str, Judgement]:
             f"highest_return[{task}]": Judgement(
                 f"{gap} to the safe baseline that decides, {100 * PRIMARY_LEVEL:g}% interval",
                 partial(highest_safe_return, task),
+                "finding",
             )
             for task in tasks
         },
-        "zero_violations": Judgement(rate, zero_violations),
+        "zero_violations": Judgement(rate, zero_violations, "finding"),
         **{
             f"unsafe[{variant}]": Judgement(rate, partial(unsafe_everywhere, variant))
             for variant in (*paper.CMDP_BASELINES, "FAC-phi0")

@@ -14,6 +14,7 @@ expected = pd.DataFrame(params.expected, columns=["task", "variant", "seed"])
 runs = pd.read_csv(given.runs)
 missing = statistics.missing_runs(expected, runs)
 rule = second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share)
+source = f"{params.flown} unseen layouts" if params.flown else "final evaluations"
 made = [
     tables.table_one(
         learned,
@@ -26,7 +27,7 @@ made = [
     tables.full_results(
         scores, missing=missing, rule=rule, layouts=params.layouts, flown=params.flown
     ),
-    differences.differences(learned, missing=missing),
+    differences.differences(learned, missing=missing, source=source),
     compute.table(runs, workers=bool(given.progress)),
 ]
 if params.push:
