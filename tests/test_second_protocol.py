@@ -304,6 +304,9 @@ def test_power_is_the_known_one_of_two_samples():
     assert power.detection_power(1.0, 17, 0.95) == pytest.approx(0.807, abs=0.02)
     assert power.detection_power(0.0, 10, 0.95) == pytest.approx(0.025, abs=0.01)
     assert power.smallest_seen(17, 0.95) == pytest.approx(0.99, abs=0.05)
+    assert power.seeds_to_see(1.0, 0.95) in (16, 17, 18)  # textbooks: 17
+    assert power.seeds_to_see(100.0, 0.95) == 2
+    assert power.seeds_to_see(0.0, 0.95) is None
 
 
 def test_what_is_seen_scales_with_the_spread():

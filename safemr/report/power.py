@@ -14,6 +14,7 @@ from safemr.report.tables import ABSENT, SafetyRule, Table
 
 SEEDS = (5, 10)
 WANTED = 0.8  # power at which a difference counts as seen
+MOST = 100  # seeds; more are not asked for
 DRAWS = 4000
 RATES = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2)
 
@@ -42,6 +43,21 @@ def smallest_seen(seeds: int, level: float) -> float:
     return high
 
 
+def seeds_to_see(gap: float, level: float) -> int | None:
+    """The fewest seeds (2 to `MOST`) that see a true difference with probability `WANTED`.
+
+    gap: in standard deviations, as in `detection_power`. None where `MOST` do not.
+    """
+    few, many = 1, MOST
+    if detection_power(gap, many, level) < WANTED:
+        return None
+    while many - few > 1:
+        middle = (few + many) // 2
+        seen = detection_power(gap, middle, level) >= WANTED
+        few, many = (few, middle) if seen else (middle, many)
+    return many
+
+
 def of_returns(
     flown: pd.DataFrame, tasks: Sequence[str], method: str, baselines: Sequence[str]
 ) -> Table:
@@ -67,25 +83,29 @@ def of_returns(
             gap = float(returns[method].mean() - returns[variant].mean())
             smallest = [pooled * unit for unit in least]
             powers = [detection_power(abs(gap) / pooled, seeds, PRIMARY_LEVEL) for seeds in SEEDS]
+            wanted = seeds_to_see(abs(gap) / pooled, PRIMARY_LEVEL)
             own = [float(v.std(ddof=1)) if len(v) > 1 else np.nan
                    for v in (returns[method], returns[variant])]  # fmt: skip
-            rows.append([task, variant, gap, *own, pooled, *smallest, *powers])
+            rows.append([task, variant, gap, *own, pooled, *smallest, *powers, wanted])
             lines.append(
                 [task, variant, f"{gap:+.2f}",
                  *(ABSENT if np.isnan(sd) else f"{sd:.2f}" for sd in own), f"{pooled:.2f}",
-                 *(f"{value:.2f}" for value in smallest), *(f"{value:.0%}" for value in powers)]
+                 *(f"{value:.2f}" for value in smallest), *(f"{value:.0%}" for value in powers),
+                 f"over {MOST}" if wanted is None else f"{wanted}"]
             )  # fmt: skip
     names = ["task", "variant", "difference", "method_sd", "variant_sd", "pooled_sd"]
     names += [f"smallest_{seeds}" for seeds in SEEDS] + [f"power_{seeds}" for seeds in SEEDS]
+    names.append("seeds_to_see")
     heads = ["task", "minus", "difference here", f"SD of {method}", "its SD", "pooled SD"]
     heads += [f"seen with {seeds} seeds" for seeds in SEEDS]
-    heads += [f"power with {seeds}" for seeds in SEEDS]
+    heads += [*(f"power with {seeds}" for seeds in SEEDS), f"seeds for {WANTED:.0%}"]
     caption = (
         f"What five and ten seeds can see of a difference of flown returns to {method}: standard "
         "deviations between runs; the least true difference at which Welch's "
         f"{100 * PRIMARY_LEVEL:g}% interval, that of the primary claim, excludes 0 in "
         f"{WANTED:.0%} of {DRAWS:,} simulated experiments with the pooled deviation of the two; "
-        "and the share in which it does so if the difference seen here is the true one."
+        "and, if the difference seen here is the true one, the share in which it does so and the "
+        f"seeds with which it does so in {WANTED:.0%}."
     )
     return Table(
         "power", caption, pd.DataFrame(rows, columns=names), pd.DataFrame(lines, columns=heads)
