@@ -664,6 +664,26 @@ def test_every_shipped_config_is_valid(path: Path) -> None:
     assert resolve(yaml.load(path.read_text(), StrictLoader)).runs
 
 
+def test_settings_of_a_family_without_an_algorithm_set_nothing(tmp_path: Path) -> None:
+    """Someone's own algorithms over a file whose tasks have settings for both families."""
+    hyperparameters = {"off_policy": {"update_every": 16}, "on_policy": {"gamma": 0.98}}
+    base, overlay = tmp_path / "base.yaml", tmp_path / "mine.yaml"
+    overrides = {"Hazards-0.15-Push": {"hyperparameters": hyperparameters}}
+    both = {**VALID, "task_overrides": overrides, "aircraft": None, "sensitivity": None}
+    both.pop("filters")
+    base.write_text(yaml.safe_dump(both))
+    for mine in (
+        {"algorithm": "joint_sis", "start_steps": 100},
+        {"algorithm": "cpo", "epoch_steps": 800},
+    ):
+        overlay.write_text(yaml.safe_dump({"algorithms": {"Mine": mine}}))
+        assert planning.resolve(config.load([base, overlay])).runs
+    hyperparameters["off_policy"]["upadte_every"] = 16  # CPO does not read it, but it is none
+    base.write_text(yaml.safe_dump(both))
+    with pytest.raises(UserError, match=r"'upadte_every' in task_overrides.*off_policy"):
+        planning.resolve(config.load([base, overlay]))
+
+
 def test_the_default_is_the_papers_grid_of_170_runs() -> None:
     plan = planning.resolve(config.load([DEFAULT]))
     assert len(plan.navigation) == 7 * 4 * 5

@@ -240,12 +240,12 @@ class _Resolver:
         for task, overrides in config.task_overrides.items():
             self._interface(task, self._task(task, "task_overrides"))
             for family, values in overrides.hyperparameters.items():
-                names = {
-                    name
-                    for algorithm in algorithms
-                    if algorithm.family == family
-                    for name in algorithm.settable
-                }
+                # A file laid over another may leave no algorithm of a family for which that one
+                # has settings: these then set nothing, and must only be names that there are.
+                concerned = [one for one in algorithms if one.family == family] or [
+                    one for one in map(load_algorithm, algorithm_names()) if one.family == family
+                ]
+                names = {name for algorithm in concerned for name in algorithm.settable}
                 for name in values.keys() - names:
                     where = f"task_overrides.{task}.hyperparameters.{family}"
                     raise unknown("hyperparameter", name, names, where)
