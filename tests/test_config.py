@@ -664,6 +664,14 @@ def test_every_shipped_config_is_valid(path: Path) -> None:
     assert resolve(yaml.load(path.read_text(), StrictLoader)).runs
 
 
+@pytest.mark.parametrize(
+    "path", sorted({*(ROOT / "config").glob("*.yaml")} - {DEFAULT}), ids=lambda path: path.stem
+)
+def test_a_shipped_configuration_is_read_by_a_protocol_of_its_own(path: Path) -> None:
+    """What it says nothing of is the default's: another default would judge its runs otherwise."""
+    assert {"protocol", "sizes"} <= yaml.safe_load(path.read_text()).keys()
+
+
 def test_settings_of_a_family_without_an_algorithm_set_nothing(tmp_path: Path) -> None:
     """Someone's own algorithms over a file whose tasks have settings for both families."""
     hyperparameters = {"off_policy": {"update_every": 16}, "on_policy": {"gamma": 0.98}}
