@@ -7,7 +7,8 @@ result depends on: the kind, its version, and the caller's inputs, among them th
 records (`Record.inputs`). What is stored under another key of the same label was superseded and is
 removed. Deleting the folder measures everything anew.
 
-Rows of numbers are kept as JSON, arrays as npz without pickles.
+Rows of numbers are kept as JSON, arrays as npz without pickles. Beside them stands by which
+revision, packages and processor they were measured: an episode differs between processors.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 
 from safemr import files
 from safemr.errors import UserError
-from safemr.experiment import records
+from safemr.experiment import provenance, records
 
 FOLDER = "measurements"
 HEADER = "measurement"  # the array of an npz that says what it is
@@ -80,7 +81,7 @@ class Measurements:
             except (ValueError, KeyError, TypeError) as error:
                 raise _damaged(path, error) from error
         value = json.loads(json.dumps(measure()))  # what a reader of the file gets
-        content = {**header, "sha256": _digest(value), "value": value}
+        content = {**header, "made": _made(), "sha256": _digest(value), "value": value}
         path.parent.mkdir(parents=True, exist_ok=True)
         # Not sorted: a table's columns keep their order.
         files.write(path, (json.dumps(content, indent=1) + "\n").encode())
@@ -104,7 +105,8 @@ class Measurements:
                     raise _unreadable(path, error.__cause__) from error
                 raise _damaged(path, error) from error
         made = measure()
-        files.save_arrays(path, {**made, HEADER: np.array(json.dumps(header, sort_keys=True))})
+        note = json.dumps({**header, "made": _made()}, sort_keys=True)
+        files.save_arrays(path, {**made, HEADER: np.array(note)})
         self._supersede(path)
         return made
 
@@ -121,6 +123,15 @@ class Measurements:
         for other in path.parent.iterdir():
             if ours.fullmatch(other.name) and other != path:
                 other.unlink(missing_ok=True)
+
+
+def _made() -> dict[str, Any]:
+    """By what a measurement is made; no part of its key, since another place would do."""
+    return {
+        "source": provenance.source_revision(),
+        "packages": provenance.package_versions(),
+        "cpu": provenance.cpu_model(),
+    }
 
 
 def _digest(value: Any) -> str:
