@@ -9,7 +9,15 @@ from sample_scores import OTHER, RETURNS, TASK, expected_runs, score_rows
 from scipy import stats
 
 from safemr import paper
-from safemr.report import compute, differences, parallel, sensitivity, statistics, tables
+from safemr.report import (
+    compute,
+    differences,
+    parallel,
+    second_protocol,
+    sensitivity,
+    statistics,
+    tables,
+)
 
 
 @pytest.fixture
@@ -240,6 +248,21 @@ def test_push_returns_are_split_into_their_parts():
     found = {row[1]: row[5:7] for row in cells(split)[2:]}
     assert found["SafeMR"] == ["1.50", "0.20"], "equal seeds are no interval"
     assert found["scripted: pushes the box"][1] == "2.40"
+
+
+@pytest.mark.parametrize("protocol", [1, 2])
+def test_the_split_says_safe_as_the_full_results_do(protocol):
+    """Three seeds without a violation are safe by the first protocol, undecided by the second."""
+    metrics = {"eval_return": 7.0, "eval_cost_indicator": 0.0, "eval_zero_violation_share": 1.0,
+               "eval_episodes": 100.0, "eval_reward_push": 4.0}  # fmt: skip
+    rows = [(OTHER, "SafeMR", seed, *pair) for seed in range(3) for pair in metrics.items()]
+    scores = pd.DataFrame(rows, columns=["task", "variant", "seed", "metric", "value"])
+    rule = second_protocol.rule_of(protocol, 1.0, 0.95)
+    split = tables.push_split(scores, [OTHER], rule=rule)
+    whole = tables.full_results(scores, rule=rule)
+    said = ["yes", "not decided"][protocol - 1]
+    assert split.display["safe"].tolist() == whole.display["safe"].tolist() == [said]
+    assert ("second protocol" in split.caption) == (protocol == 2)
 
 
 def test_an_interval_is_printed_as_what_it_is():

@@ -262,38 +262,38 @@ def full_results(
         seeds = str(int(chosen["count"].max())) if len(chosen) else MISSING
         rows.append([task, variant, seeds, safe or ABSENT, *cells])
     display = pd.DataFrame(rows, columns=["task", "algorithm", "seeds", "safe", *metrics.values()])
-    source = (
-        f"flown on {flown} unseen layouts"
-        if flown
-        else f"mean over the last 10% of evaluations, on {layouts} fixed layouts"
-    )
+    source = f"mean over the last 10% of evaluations, on {layouts} fixed layouts"
+    if flown:
+        source = f"flown on {flown} unseen layouts"
     caption = (
-        f"Full results: final performance of the deterministic policy ({source}), mean over "
-        "seeds ± half width of the 95% t "
-        f"interval, or [its ends] where it is cut off at a bound of the quantity. {FEW} From four "
-        "seeds on the IQM in brackets after the return. Cost is the authors' (pillars: contact "
-        "steps of the body; hazards: summed depth); any contact counts the robot's nose too; in "
-        "all of training: violating steps of a whole run, whose length differs between the "
-        "families. "
+        f"Full results: final performance of the deterministic policy ({source}), mean over seeds "
+        "± half width of the 95% t interval, or [its ends] where it is cut off at a bound of the "
+        f"quantity. {FEW} From four seeds on the IQM in brackets after the return. Cost is the "
+        "authors' (pillars: contact steps of the body; hazards: summed depth); any contact counts "
+        "the robot's nose too; in all of training: violating steps of a whole run, whose length "
+        "differs between the families. "
         f"{str(rule).capitalize()}. Scripted controllers see the full state and are not learned."
     )
     return Table(name, caption, data, display, missing_notes(missing, None, None))
 
 
 def push_split(
-    scores: pd.DataFrame, tasks: Sequence[str], *, missing: pd.DataFrame | None = None
+    scores: pd.DataFrame,
+    tasks: Sequence[str],
+    *,
+    missing: pd.DataFrame | None = None,
+    rule: SafetyRule | None = None,
 ) -> Table:
-    """Returns of the tasks with a box split into approach, push and goal bonus, with the scripted
-    lines."""
-    push = scores[scores["task"].isin(list(tasks))]
+    """Returns of tasks with a box by approach, push and goal bonus, with the scripted lines."""
     absent = None if missing is None else missing[missing["task"].isin(list(tasks))]
-    table = full_results(push, missing=absent, metrics=REWARD_PARTS, name="push_split")
+    push = scores[scores["task"].isin(list(tasks))]
+    table = full_results(push, missing=absent, rule=rule, metrics=REWARD_PARTS, name="push_split")
     caption = (
         "Push returns by part: approach is earned by walking to the box, push by bringing the box "
         "nearer to the goal, the bonus by goals reached. Mean over seeds ± half width of the 95% t "
         f"interval, or [its ends] where it is cut off at a bound of the quantity. {FEW} From four "
-        "seeds on the IQM in brackets after the return. A return near that of touching the box "
-        "says nothing about pushing."
+        f"seeds on the IQM in brackets after the return. {str(rule or SafetyRule()).capitalize()}. "
+        "A return near that of touching the box says nothing about pushing."
     )
     return Table(table.name, caption, table.data, table.display, table.notes)
 

@@ -31,7 +31,7 @@ made = [
     compute.table(runs, workers=bool(given.progress)),
 ]
 if params.push:
-    made.append(tables.push_split(scores, params.push, missing=missing))
+    made.append(tables.push_split(scores, params.push, missing=missing, rule=rule))
 if given.progress:
     progress = pd.read_csv(given.progress)
     made.append(parallel.table(learned, progress, runs, missing=missing))
