@@ -466,6 +466,31 @@ def test_the_finding_names_all_and_says_how_far_the_method_is_ahead(progress):
     assert x == pytest.approx(60.0)
 
 
+def test_names_stand_nearest_to_their_own_marks():
+    """Three safe ones above each other, as on Hazards-0.30-Push."""
+    means = {"SafeMR": (0.0, 7.9, 0.8), "JointSIS": (0.0, 6.0, 1.4), "CPO": (28.0, 10.0, 0.0),
+             "FAC-phi0": (27.8, 10.5, 1.1), "FAC-phih": (0.0, 7.2, 1.3)}  # fmt: skip
+    tasks = ["first", "second", "third", "fourth"]  # four panels, of which each is small
+    rows = [
+        {"task": task, "variant": name, "safe": dirty == 0, "return": y, "return_low": y - half,
+         "return_high": y + half, "dirty": dirty, "dirty_low": 0.8 * dirty,
+         "dirty_high": 1.2 * dirty + 1.5}
+        for task in tasks for name, (dirty, y, half) in means.items()
+    ]  # fmt: skip
+    said = pd.DataFrame({"task": tasks, "text": "two lines of title"})
+    figure = finding_figure.finding(pd.DataFrame(rows), said, tasks)
+    for ax in figure.axes:
+        drawn = [
+            next(name for name in means if style.label(name) == t.get_text()) for t in ax.texts
+        ]
+        marks = ax.transData.transform([means[name][:2] for name in drawn])
+        for own, text in enumerate(ax.texts):
+            box = text.get_window_extent()
+            across, up = (np.clip(marks, box.p0, box.p1) - marks).T
+            gaps = np.hypot(0.5 * across, up)  # what is on its line is read with it
+            assert 1.2 * gaps[own] < np.delete(gaps, own).min(), text.get_text()
+
+
 def test_what_some_seeds_call_unsafe_is_shaded_once(monkeypatch):
     x = y = np.linspace(-8.0, 8.0, 33)
     d = np.hypot(*np.meshgrid(x, y, indexing="ij"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pandas as pd
 
 from safemr import paper
@@ -34,10 +36,16 @@ def points(flown: pd.DataFrame, rule: SafetyRule) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*columns, "steps"])
 
 
-def ahead(flown: pd.DataFrame, found: pd.DataFrame, method: str = paper.METHOD) -> pd.DataFrame:
+def ahead(
+    flown: pd.DataFrame,
+    found: pd.DataFrame,
+    method: str = paper.METHOD,
+    printed: Callable[[str], str] = str,
+) -> pd.DataFrame:
     """task, text: the method's return minus that of the best other safe one, Welch's interval.
 
-    found: `points`. Where the method is not safe, or nobody else is, the text says that.
+    found: `points`. printed: a variant's name as the text has it. Where the method is not safe, or
+    nobody else is, the text says that.
     """
     rows = []
     for task, group in found.groupby("task", sort=False):
@@ -61,6 +69,7 @@ def ahead(flown: pd.DataFrame, found: pd.DataFrame, method: str = paper.METHOD) 
             )
             gap = statistics.difference_interval(first, second)
             interval = "" if pd.isna(gap.low) else rf" $\pm$ {gap.half_width:.1f}"
-            text = f"{method} $-$ {rival}, the best other safe one: {gap.mean:+.1f}{interval}"
+            names = f"{printed(method)} $-$ {printed(rival)}"
+            text = f"{names}, the best other safe one: {gap.mean:+.1f}{interval}"
         rows.append((task, text))
     return pd.DataFrame(rows, columns=["task", "text"])

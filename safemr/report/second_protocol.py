@@ -102,7 +102,7 @@ class RateRule(SafetyRule):
     @property
     def marks(self) -> tuple[str, str]:
         """What a filled and a hollow mark say where the limit is drawn."""
-        return "safe: the interval of their rate, too", "not safe, or not decided"
+        return "safe: the whole interval lies there", "not safe, or not decided"
 
     def label(self, scores: pd.DataFrame, task: str, variant: str) -> Label | None:
         """Safe where the interval is at or below the limit, not safe where above, else open."""

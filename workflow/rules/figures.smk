@@ -216,6 +216,7 @@ rule finding:
         variants=GRID["variants"],
         seeds=BUDGET["seeds"],
         episodes=CONFIG.unseen_layouts and CONFIG.unseen_layouts.episodes,
+        own=CONFIG.unseen_layouts and CONFIG.unseen_layouts.own,
         sources=sources("finding"),
     script:
         "../scripts/finding.py"

@@ -13,12 +13,13 @@ flown = pd.concat([pd.read_csv(path) for path in snakemake.input], ignore_index=
 flown = flown[flown["variant"].isin(list(params.variants))]
 rule = second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share)
 found = finding.points(flown, rule)
+each = " for each seed" if params.own else ""
 figure = drawing.finding(
     found,
-    finding.ahead(flown, found, params.method),
+    finding.ahead(flown, found, params.method, style.label),
     params.tasks,
     method=params.method,
     rule=rule,
-    where=f"Final policies on {params.episodes} layouts that no run was evaluated on",
+    where=f"Final policies on {params.episodes} layouts{each} that no run was evaluated on",
 )
 style.save(figure, Path(snakemake.output.pdf[0]).with_suffix(""))

@@ -66,22 +66,39 @@ def name_marks(points: pd.DataFrame, ax: Axes, *, bold: str = "") -> None:
             if not np.isnan([*low, *high]).any():
                 (x0, y0), (x1, y1) = ax.transData.transform([low, high])
                 covered.append((Bbox.from_extents(x0 - 1, y0 - 1, x1 + 1, y1 + 1), 1.0))
-    for mark, variant in zip(marks, points["variant"], strict=True):
+    texts = []
+    for variant in points["variant"]:
         text = ax.annotate(
-            style.label(variant), mark / scale, xycoords="figure points", fontsize=style.SMALL,
+            style.label(variant), (0, 0), xycoords="figure points", fontsize=style.SMALL,
             fontweight="bold" if variant == bold else "normal", zorder=5,
         )  # fmt: skip
         text.set_path_effects([Stroke(linewidth=1.6, foreground="white"), Normal()])
         text.set_in_layout(False)
-        size = text.get_window_extent()
-        best = min(
-            (_cost(_placed(mark, size, side, reach * scale), covered, ax) + reach / 10, order)
-            for order, (reach, side) in enumerate((r, s) for r in _REACHES for s in _SIDES)
-        )[1]
-        reach, side = [(r, s) for r in _REACHES for s in _SIDES][best]
-        box = _placed(mark, size, side, reach * scale)
+        texts.append(text)
+    places = [
+        [
+            (_placed(mark, text.get_window_extent(), side, reach * scale), reach)
+            for reach in _REACHES
+            for side in _SIDES
+        ]
+        for mark, text in zip(marks, texts, strict=True)
+    ]
+    alone = [
+        [_cost(box, covered, ax) + reach / 10 + _astray(box, own, marks) for box, reach in found]
+        for own, found in enumerate(places)
+    ]
+    chosen: dict[int, int] = {}
+    for _ in range(5):  # each beside the others as they stand, until none moves
+        before = dict(chosen)
+        for own, found in enumerate(places):
+            others = [(places[o][at][0], 6.0) for o, at in chosen.items() if o != own]
+            costs = [c + _common(b, others) for (b, _), c in zip(found, alone[own], strict=True)]
+            chosen[own] = int(np.argmin(costs))
+        if chosen == before:
+            break
+    for own, (mark, text) in enumerate(zip(marks, texts, strict=True)):
+        box, reach = places[own][chosen[own]]
         text.set_position((box.x0 / scale, box.y0 / scale))
-        covered.append((box, 6.0))
         if reach > _REACHES[0]:
             near = np.clip(mark, [box.x0, box.y0], [box.x1, box.y1])
             ends = ax.transData.inverted().transform([mark, near])
@@ -99,13 +116,24 @@ def _placed(
 
 def _cost(box: Bbox, covered: Sequence[tuple[Bbox, float]], ax: Axes) -> float:
     """Square pixels that a name covers of others, weighted, and of what is outside."""
+    inside = _common(box, [(ax.bbox.padded(-4), 1.0)])
+    return _common(box, covered) + 10 * (box.width * box.height - inside)
 
-    def common(other: Bbox) -> float:
-        both = Bbox.intersection(box, other)
-        return 0.0 if both is None else both.width * both.height
 
-    outside = box.width * box.height - common(ax.bbox)
-    return sum(weight * common(other) for other, weight in covered) + 10 * outside
+def _common(box: Bbox, covered: Sequence[tuple[Bbox, float]]) -> float:
+    """Square pixels that a name covers of others, weighted."""
+    shared = ((Bbox.intersection(box, other), weight) for other, weight in covered)
+    return sum(weight * both.width * both.height for both, weight in shared if both is not None)
+
+
+def _astray(box: Bbox, own: int, marks: np.ndarray) -> float:
+    """A line's height squared where another mark is about as near to a name as its own.
+
+    A name is read with the mark on its line: across counts half.
+    """
+    gaps = np.hypot(*(np.clip(marks, box.p0, box.p1) - marks).T * [[0.5], [1.0]])
+    others = np.delete(gaps, own)
+    return box.height**2 if others.size and others.min() < 1.4 * gaps[own] else 0.0
 
 
 @style.styled
