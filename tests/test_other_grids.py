@@ -191,7 +191,10 @@ def test_a_recording_shorter_than_the_animation_ends_it(tmp_path: Path) -> None:
 
 # --- the whole pipeline --------------------------------------------------------------------------
 
-NOTHING_ELSE = {"unseen_layouts": None, "sensitivity": None, "aircraft": None}
+NOTHING_ELSE: dict[str, Any] = {
+    **{"unseen_layouts": None, "protocol": 1, "sizes": False},
+    **{"sensitivity": None, "aircraft": None},
+}
 SMALL = {
     "algorithms": {
         "SafeMR": {"algorithm": "safemr", "start_steps": 200},

@@ -93,7 +93,8 @@ def test_a_watch_ends_with_the_last_record(
         "tasks": ["Pillars-0.15-Goal"], "algorithms": {"FAC": {"algorithm": "fac"}}, "seeds": [100],
         "budget": {"off_policy": 6000}, "log_points": 1, "task_overrides": {},
         "evaluation": {"points": 1, "episodes": 1}, "results_root": str(tmp_path / "results"),
-        "sensitivity": None, "aircraft": None, "unseen_layouts": None,
+        "sensitivity": None, "aircraft": None,
+        "unseen_layouts": None, "protocol": 1, "sizes": False,
     }  # fmt: skip
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(chosen))
     (planned,) = planning.resolve(config.load([progress.DEFAULT, tmp_path / "c.yaml"])).runs

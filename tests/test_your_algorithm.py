@@ -114,7 +114,7 @@ def test_a_configuration_names_it_and_notices_its_edits(
     (package / "own.py").write_text(source)
     raw = yaml.safe_load((ROOT / "config/config.yaml").read_text())
     raw |= {"tasks": ["Aircraft"], "seeds": [0], "sensitivity": None, "aircraft": None}
-    raw |= {"task_overrides": {}, "unseen_layouts": None}
+    raw |= {"task_overrides": {}, "unseen_layouts": None, "protocol": 1, "sizes": False}
     monkeypatch.chdir(tmp_path)
 
     def plan(algorithms: dict[str, Any]) -> planning.Plan:

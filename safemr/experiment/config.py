@@ -238,7 +238,9 @@ def parse(raw: Any) -> Config:
         sizes=flag(top.get("sizes", False), "sizes"),
     )
     if config.protocol == 2 and not config.unseen_layouts:
-        raise UserError("protocol: 2 judges flights on unseen layouts; say unseen_layouts, too")
+        raise UserError(
+            "protocol: 2 judges flights on unseen layouts: say unseen_layouts, too, or protocol: 1"
+        )
     flights = config.unseen_layouts
     if flights and flights.own:
         last = own_layouts(flights.seed, flights.episodes, max(seeds) + 1)
@@ -248,7 +250,9 @@ def parse(raw: Any) -> Config:
                 f"{LARGEST_SEED}; choose smaller seeds"
             )
     if config.sizes and not config.unseen_layouts:
-        raise UserError("sizes: true draws returns on unseen layouts; say unseen_layouts, too")
+        raise UserError(
+            "sizes: true draws returns on unseen layouts: say unseen_layouts, too, or sizes: false"
+        )
     if config.log_points % config.evaluation.points:
         raise UserError(
             f"log_points = {config.log_points} must be a multiple of evaluation.points = "
