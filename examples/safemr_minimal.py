@@ -58,7 +58,7 @@ class Config:
     multiplier_delay: int = 4  # m_lambda
     certificate_delay: int = 16  # m_phi: zeta moves slowest, so that the others can follow it
     num_envs: int = 16
-    update_every: int = 8  # environment steps per gradient step; the Push tasks' records: 16
+    update_every: int = 8  # environment steps per gradient step
     updates_together: int = 4  # gradient steps that share one draw and its targets
     batch_size: int = 256
     replay_capacity: int = 500_000
