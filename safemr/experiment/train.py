@@ -161,7 +161,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--task-name", help="what the task is called with settings of its own")
     parser.add_argument("--algorithm", help=f"one of {', '.join(planning.algorithm_names())}")
-    parser.add_argument("--seed", type=int, default=100, help="0-4 are the reported seeds")
+    parser.add_argument("--seed", type=int, default=100, help="0-9 are the reported seeds")
     parser.add_argument("--steps", type=int, default=320_000, help="environment steps")
     parser.add_argument(
         "--set",
