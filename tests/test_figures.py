@@ -456,6 +456,8 @@ def test_the_finding_names_all_and_says_how_far_the_method_is_ahead(progress):
         )
     )
     assert f"{gap.mean:+.1f} $\\pm$ {gap.half_width:.1f}" in ahead["text"].iloc[0]
+    without = finding.ahead(flown, points, baselines=["CPO", "mine"])["text"].iloc[0]
+    assert "JointSIS" not in without
     ax = finding_figure.finding(points, ahead, TASKS).axes[0]
     assert [text.get_text() for text in ax.texts] == ["SafeMR", "JointSIS", "CPO", "mine"]
     boxes = [text.get_window_extent() for text in ax.texts]

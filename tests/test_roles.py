@@ -39,12 +39,13 @@ def plan_of(algorithms: dict[str, Any], **changes: Any) -> planning.Plan:
 
 def test_the_default_grid_has_the_roles_of_the_paper() -> None:
     plan = planning.resolve(config.parse(DEFAULT))
-    assert plan.grid.of("method") == [paper.METHOD]
+    assert plan.grid.of("method") == [paper.METHOD, "FAC-oracle", "SafeMR-guarded"]
     assert plan.grid.of("ablation") == [paper.ABLATION]
     assert plan.grid.of("handcrafted") == ["FAC-phi0", "FAC-phih"]
     assert plan.grid.of("baseline") == [*paper.CMDP_BASELINES]
     assert plan.grid.rivals == [*paper.BASELINES]
-    assert plan.grid.learned == plan.encounter.pair() == [paper.METHOD, paper.ABLATION]
+    assert plan.grid.pair() == plan.encounter.pair() == [paper.METHOD, paper.ABLATION]
+    assert plan.grid.learned == [paper.METHOD, paper.ABLATION, "SafeMR-guarded"]
     assert plan.encounter.of("handcrafted") == ["FAC-phi0", "FAC-phih"]
 
 
@@ -181,3 +182,20 @@ def test_no_rule_reads_a_label_or_lists_algorithms() -> None:
         if path.is_file() and path.name not in excused and label in path.read_text()
     }
     assert not found
+
+
+@pytest.mark.parametrize(
+    ("own", "told"),
+    [
+        ({}, "0 to 3"),
+        ({"JointSIS": [0, 2]}, "0 to 3 (JointSIS: 0, 2)"),
+        ({"FAC": [1, 2, 3], "PPO-L": [1, 2, 3]}, "0 to 3 (FAC, PPO-L: 1 to 3)"),
+    ],
+)
+def test_captions_tell_whose_seeds_are_others(own: dict[str, list[int]], told: str) -> None:
+    entries = {"SafeMR": "safemr", "JointSIS": "joint_sis", "FAC": "fac", "PPO-L": "ppo_lagrangian"}
+    algorithms = {
+        label: {"algorithm": name, **({"seeds": own[label]} if label in own else {})}
+        for label, name in entries.items()
+    }
+    assert plan_of(algorithms, seeds=[3, 0, 1, 2]).seeds_told == told

@@ -13,7 +13,9 @@ from safemr.report.findings import NOTHING, Finding, overall
 from safemr.report.verdicts import ROWS, verdicts
 
 FIGURES = PurePath("../../paper_figures")
-RUNS = pd.DataFrame({"seed": [0, 1, 2], "cpu_s": [3600.0, 1800.0, float("nan")]})
+RUNS = pd.DataFrame(
+    {"task": "t", "variant": "v", "seed": [0, 1, 2], "cpu_s": [3600.0, 1800.0, float("nan")]}
+)
 
 
 def table(**changed: str) -> pd.DataFrame:
@@ -37,6 +39,9 @@ def test_every_claim_is_in_the_table_which_has_at_most_eight_rows() -> None:
     assert len(ROWS) <= 8
     assert {verdict.partition(":")[0] for verdict, _ in cells(text).values()} == {"**confirmed**"}
     assert "3 recorded runs (seeds 0 to 2; 1.5 core-hours in all)" in text
+    more = pd.concat([RUNS, RUNS.assign(variant="w").iloc[:2]])
+    told = verdicts(table(), more, FIGURES)
+    assert "5 recorded runs (seeds 0 to 2, 2 to 3 of them each; 3.0 core-hours" in told
     with pytest.raises(KeyError):
         verdicts(
             pd.DataFrame([["new[x]", "refuted", "why", "f"]], columns=table().columns),

@@ -8,7 +8,8 @@ numbers changes the digest, and with it the folder of the record.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,29 @@ class Plan:
     def runs(self) -> tuple[Run, ...]:
         """Every run, the outside ones last."""
         return (*self.trained, *self.outside)
+
+    @property
+    def seeds_told(self) -> str:
+        """For captions: the seeds on the navigation tasks, and the variants with others."""
+        of: dict[str, set[int]] = {}
+        for run in self.navigation:
+            of.setdefault(run.variant, set()).add(run.seed)
+        told = {variant: _listed(seeds) for variant, seeds in of.items()}
+        ((most, _),) = Counter(told.values()).most_common(1) or [("", 0)]
+        others: dict[str, list[str]] = {}
+        for variant, seeds in told.items():
+            if seeds != most:
+                others.setdefault(seeds, []).append(variant)
+        rest = "; ".join(f"{', '.join(names)}: {seeds}" for seeds, names in others.items())
+        return f"{most} ({rest})" if rest else most
+
+
+def _listed(seeds: Iterable[int]) -> str:
+    """0 to 4, or 0, 1, 3."""
+    numbers = sorted(seeds)
+    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+        return f"{numbers[0]} to {numbers[-1]}"
+    return ", ".join(map(str, numbers))
 
 
 def check_setting(

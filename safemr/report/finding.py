@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import pandas as pd
 
@@ -41,11 +41,13 @@ def ahead(
     found: pd.DataFrame,
     method: str = paper.METHOD,
     printed: Callable[[str], str] = str,
+    baselines: Collection[str] | None = None,
 ) -> pd.DataFrame:
-    """task, text: the method's return minus that of the best other safe one, Welch's interval.
+    """task, text: the method's return minus that of the best safe baseline, Welch's interval.
 
-    found: `points`. printed: a variant's name as the text has it. Where the method is not safe, or
-    nobody else is, the text says that.
+    found: `points`. printed: a variant's name as the text has it. baselines: those it is compared
+    with, without all others; other forms of the method are none. Where the method is not safe, or
+    no baseline is, the text says that.
     """
     rows = []
     for task, group in found.groupby("task", sort=False):
@@ -53,7 +55,9 @@ def ahead(
         if ours.empty:
             continue
         others = group[group["safe"] & (group["variant"] != method)]
-        text = "no other is safe"
+        if baselines is not None:
+            others = others[others["variant"].isin(list(baselines))]
+        text = "no baseline is safe"
         if ours["label"].item() == "not decided":
             dirty = ours["dirty"].item()
             text = f"whether {method} is safe is not decided: {dirty:.1f}% of episodes"
@@ -70,6 +74,6 @@ def ahead(
             gap = statistics.difference_interval(first, second)
             interval = "" if pd.isna(gap.low) else rf" $\pm$ {gap.half_width:.1f}"
             names = f"{printed(method)} $-$ {printed(rival)}"
-            text = f"{names}, the best other safe one: {gap.mean:+.1f}{interval}"
+            text = f"{names}, the best safe baseline: {gap.mean:+.1f}{interval}"
         rows.append((task, text))
     return pd.DataFrame(rows, columns=["task", "text"])

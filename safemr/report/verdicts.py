@@ -88,6 +88,9 @@ def _caption(runs: pd.DataFrame) -> str:
     seeds = sorted(runs["seed"].unique())
     together = len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1
     shown = f"{seeds[0]} to {seeds[-1]}" if together else ", ".join(map(str, seeds))
+    each = runs.groupby(["task", "variant"])["seed"].nunique()
+    if each.min() < len(seeds):
+        shown += f", {each.min()} to {each.max()} of them each" if each.max() > each.min() else ""
     hours = runs["cpu_s"].sum() / 3600
     return (
         f"The paper's claims, judged by code from {len(runs)} recorded runs (seed"

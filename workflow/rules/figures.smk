@@ -199,7 +199,7 @@ rule policies:
 
 # The picture of the README, where the policies have flown unseen layouts.
 FLOWN_TASKS = [task for task in CONFIG.tasks if task in FLOWN]
-UNSEEN = dict(method=METHOD, **SAFE)
+UNSEEN = dict(method=METHOD, baselines=PLAN.grid.rivals, **SAFE)
 
 
 rule finding:

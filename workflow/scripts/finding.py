@@ -16,7 +16,7 @@ found = finding.points(flown, rule)
 each = " for each seed" if params.own else ""
 figure = drawing.finding(
     found,
-    finding.ahead(flown, found, params.method, style.label),
+    finding.ahead(flown, found, params.method, style.label, params.baselines),
     params.tasks,
     method=params.method,
     rule=rule,

@@ -20,7 +20,7 @@ params = snakemake.params
 flown = pd.read_csv(snakemake.input.flown)
 rule = second_protocol.rule_of(params.protocol, params.tolerance, params.clean_share)
 points = finding.points(flown, rule)
-rivals = points[(points["label"] == "no") & (points["variant"] != params.method)]
+rivals = points[(points["label"] == "no") & points["variant"].isin(list(params.baselines))]
 rivals = rivals[rivals["variant"].isin(list(params.folders))].sort_values("return")
 shown = [params.method, *rivals["variant"].tail(1)]
 recorded, energies = {}, {}

@@ -142,6 +142,12 @@ def training_curves(
         axes[0, 0].set_xlim(ends["min"].min() if wide else 0, ends["max"].max())
     for ax in axes[1]:
         style.steps_axis(ax, logarithmic=wide)
+    if len(tasks) > 2:  # one name for all, as several would run into each other
+        name = axes[1, 0].get_xlabel()
+        for ax in axes[1]:
+            ax.set_xlabel("")
+        middle, even = divmod(len(tasks), 2)
+        axes[1, middle].set_xlabel(name, x=0.5 if even else -0.1)
     for ax in axes[1, 1:]:
         ax.tick_params(axis="y", labelleft=False)
     axes[0, 0].set_ylabel("expected return\n(per episode)")

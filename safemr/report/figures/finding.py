@@ -187,9 +187,7 @@ def finding(
     ]  # fmt: skip
     if not named:
         handles += style.marks(variants)
-    names = [*(str(handle.get_label()) for handle in handles)]
-    ncols = style.legend_columns(names) if not named else 4 if width > style.COLUMN_WIDTH else 1
-    style.legend_below(figure, handles, ncols)
+    style.legend_below(figure, handles, 4 if width > style.COLUMN_WIDTH else 1)
     if where:
         figure.suptitle(where)
     if named:

@@ -203,7 +203,7 @@ def aggregate_scores(
             ax.set_title(few, fontsize=style.SMALL, color="0.4", style="italic")
     draw_intervals(aggregates.improvement, right, neutral=0.5)
     right.set_xlim(-0.03, 1.03)
-    right.set_xlabel(rf"$P$({style.label(method)} $>$ baseline)")
+    right.set_xlabel(rf"$P$({style.label(method)} $>$ other)")
     for letter, ax in zip("abc", (left, middle, right), strict=True):
         style.panel_letter(ax, letter)
     handles = [
