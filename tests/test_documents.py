@@ -331,3 +331,25 @@ def test_the_two_certificates_beside_the_papers_are_told_as_flown() -> None:
         assert "| " + " | ".join([task, areas[0], *gaps, *dirty]) + " |" in page
         own = sizes.loc[(task, "SafeMR-guarded")]
         assert own["feasible"] == own["certificates"]
+
+
+def test_where_the_guarded_descent_rests_is_told_as_recorded() -> None:
+    said = text_of((ROOT / "docs/oracle.md").read_text())
+    sizes = pd.read_csv(ROOT / "results/tables/sizes.csv").set_index(["task", "certificate"])[
+        "area"
+    ]
+    ratios, spread, moved = [], {}, []
+    for task in dict.fromkeys(sizes.index.get_level_values("task")):
+        ratios.append(sizes[task, "SafeMR-guarded"] / sizes[task, "SafeMR"])
+        ends = []
+        for path in sorted(ROOT.glob(f"results/runs/{task}/SafeMR-guarded/*/progress.csv")):
+            late = column(path, "step") >= 0.6 * column(path, "step")[-1]
+            zeta = np.stack([column(path, name)[late] for name in ("sigma", "k", "n")], axis=1)
+            moved.append(np.abs(zeta / zeta[-1] - 1).max())
+            ends.append(zeta[-1])
+        spread[task] = (np.ptp(ends, axis=0) / np.min(ends, axis=0))[1:]
+    assert f"with {min(ratios):.2f} to {max(ratios):.2f} of SafeMR's unsafe area" in said
+    del spread["Pillars-0.30-Goal"]
+    k, n = 100 * np.max(list(spread.values()), axis=0)
+    assert f"end within {np.ceil(k):.0f} and {np.ceil(n):.0f}% of each other" in said
+    assert f"no parameter moves by more than {np.ceil(100 * max(moved)):.0f}%" in said
