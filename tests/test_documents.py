@@ -331,6 +331,13 @@ def test_the_two_certificates_beside_the_papers_are_told_as_flown() -> None:
         assert "| " + " | ".join([task, areas[0], *gaps, *dirty]) + " |" in page
         own = sizes.loc[(task, "SafeMR-guarded")]
         assert own["feasible"] == own["certificates"]
+    told = []
+    for name in ("SafeMR", "SafeMR-guarded", "FAC-oracle"):
+        of = flown.xs(name, level="variant")[["violating_episodes", "episodes"]].sum()
+        told.append((of["violating_episodes"], f"{of['episodes']:,}"))
+    (two, all_of), (guarded, four), (least, _) = told
+    assert f"violate in {['no', 'one', 'two'][two]} of {all_of} episodes" in text_of(page)
+    assert f"in {guarded} of {four} and of FAC-oracle in {least} of {four}," in text_of(page)
 
 
 def test_where_the_guarded_descent_rests_is_told_as_recorded() -> None:
