@@ -727,3 +727,13 @@ def test_sizes_are_drawn_against_flights_on_unseen_layouts() -> None:
     assert config.parse(VALID | {"sizes": True}).sizes
     with pytest.raises(UserError, match="say unseen_layouts, too"):
         config.parse(VALID | {"sizes": True, "unseen_layouts": None})
+
+
+def test_sizes_may_stand_beside_those_of_another_root() -> None:
+    assert config.parse(VALID | {"sizes": True}).sizes_beside is None
+    both = config.parse(VALID | {"sizes": {"beside": "results"}})
+    assert both.sizes
+    assert both.sizes_beside == Path("results")
+    for wrong in ({}, {"besides": "results"}, {"beside": ""}, {"beside": "config"}, "yes"):
+        with pytest.raises(UserError, match="sizes"):
+            config.parse(VALID | {"sizes": wrong})

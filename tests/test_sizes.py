@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from safemr import cli
+from safemr.errors import UserError
 from safemr.measure.oracle import COLUMNS
 from safemr.report import sizes
 from safemr.report.figures.filters import behind_filters
@@ -52,7 +53,7 @@ def scores(path: Path) -> Path:
 
 
 def test_runs_meet_their_flights(tmp_path: Path) -> None:
-    points = sizes.merged(certificates(), [scores(tmp_path / "flown.csv")])
+    points = sizes.merged(certificates(), pd.read_csv(scores(tmp_path / "flown.csv")))
     assert len(points) == 4  # PPO-L has no certificate, phi_h no flight
     assert points.set_index(["variant", "seed"]).loc[("A", 2), "return"] == 12.0
     assert points["feasible"].tolist() == [True, True, False, True]
@@ -62,6 +63,48 @@ def test_runs_meet_their_flights(tmp_path: Path) -> None:
     assert sum(len(line.get_xdata()) for line in drawn) == 4
     hollow = [line for line in drawn if line.get_markerfacecolor() == "none"]
     assert [line.get_xdata().tolist() for line in hollow] == [[3.0]]
+
+
+def beside(folder: Path, area: float = 0.5) -> list[Path]:
+    """The files of another configuration: a run of A and two of C, and flights of all three."""
+    folder.mkdir(exist_ok=True)
+    theirs = certificates().head(2).copy()
+    theirs["area"] = [area, 1.5]
+    rows = [(TASK, f"{v} (seed {s})", v, s, 0.1, 1.0, 2.0, 0.3, 1000, 0, np.nan)
+            for v, s in [("A", 7), ("C", 0), ("C", 1)]]  # fmt: skip
+    pd.concat([theirs, pd.DataFrame(rows, columns=list(COLUMNS))]).to_csv(
+        folder / "sizes.csv", index=False
+    )
+    flown = [(TASK, v, s, metric, 5.0) for v, s in [("A", 7), ("C", 0), ("C", 1)]
+             for metric in ("eval_return", "eval_cost_indicator")]  # fmt: skip
+    columns = ["task", "variant", "seed", "metric", "value"]
+    pd.DataFrame(flown, columns=columns).to_csv(folder / "flown.csv", index=False)
+    return [folder / "sizes.csv", folder / "flown.csv"]
+
+
+def test_certificates_of_another_configuration_stand_beside_these(tmp_path: Path) -> None:
+    ours = certificates()
+    others = sizes.Others.read(*beside(tmp_path / "summary"), ours=ours)
+    assert others.variants == ["C"]  # A is ours, and not mixed with theirs
+    made = sizes.table(ours, others)
+    assert made.data.set_index("certificate")["runs"].to_dict() == {
+        "oracle": 0, "phi_h": 0, "A": 3, "B": 1, "C": 2
+    }  # fmt: skip
+    assert made.caption.endswith(f"Of another configuration's runs (under {tmp_path}): C.")
+    points = sizes.merged(others.sizes, others.flown)
+    assert points[["variant", "seed", "return"]].values.tolist() == [["C", 0, 5.0], ["C", 1, 5.0]]
+
+
+def test_sizes_for_other_decisions_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"on Pillars-0.15-Goal .* the decisions are not the same"):
+        sizes.Others.read(*beside(tmp_path / "summary", area=0.6), ours=certificates())
+
+
+def test_what_is_missing_of_another_configuration_is_named(tmp_path: Path) -> None:
+    files = beside(tmp_path / "summary")
+    files[1].unlink()
+    with pytest.raises(UserError, match=r"flown.csv is missing; make the results under"):
+        sizes.Others.read(*files, ours=certificates())
 
 
 def test_the_filters_figure_shows_every_flight() -> None:

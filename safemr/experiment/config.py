@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import difflib
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from safemr.conventions import (
 from safemr.errors import UserError, show
 from safemr.experiment.filter_entries import Filters, read_filters
 from safemr.experiment.roles import ROLES
+from safemr.experiment.roots import root
 from safemr.experiment.sections import (
     LARGEST_SEED,
     Section,
@@ -42,17 +42,11 @@ from safemr.experiment.sections import (
 )
 from safemr.experiment.strict_yaml import read_yaml, typed
 from safemr.experiment.task_entries import ForeignTask
-from safemr.files import REPOSITORY
 from safemr.learning.interface import Interface
 from safemr.names import unknown
 
 FAMILIES = ("off_policy", "on_policy")
 WANDB_MODES = ("disabled", "offline", "online")
-_ROOT = re.compile(r"(/|(\.\./)*)[A-Za-z0-9_][A-Za-z0-9._-]*(/[A-Za-z0-9_][A-Za-z0-9._-]*)*")
-_SOURCES = {
-    *("benchmarks", "config", "docs", "envs", "examples", "profiles", "safemr", "tests"),
-    "workflow",
-}
 
 
 @dataclass(frozen=True)
@@ -167,6 +161,7 @@ class Config:
     zero_violation_share: float
     filters: Filters | None
     sizes: bool  # whether certificates are compared with the least feasible one
+    sizes_beside: Path | None  # another results root whose certificates are shown beside these
 
 
 def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None) -> Config:
@@ -193,6 +188,7 @@ def parse(raw: Any) -> Config:
     tasks = _tasks(top.required("tasks"), "tasks")
     seeds = seeds_in(top.required("seeds"), "seeds")
     least = min(seeds)  # decides whose layouts those are that are not named
+    sizes, beside = _sizes(top.get("sizes", False))
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
         raise unknown("wandb mode", mode, WANDB_MODES)
@@ -223,8 +219,8 @@ def parse(raw: Any) -> Config:
             label: _outside(value, f"outside.{label}")
             for label, value in labelled(top.get("outside", {}), "outside")
         },
-        results_root=_root(top.get("results_root", "results"), "results_root"),
-        figures_root=_root(top.get("figures_root", "paper_figures"), "figures_root"),
+        results_root=root(top.get("results_root", "results"), "results_root"),
+        figures_root=root(top.get("figures_root", "paper_figures"), "figures_root"),
         allow_missing=flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,
         wandb_project=checked_name(wandb.get("project", "safemr"), "wandb.project"),
@@ -235,7 +231,8 @@ def parse(raw: Any) -> Config:
             safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
         filters=read_filters(top.get("filters"), top.required("algorithms"), tasks, seeds),
-        sizes=flag(top.get("sizes", False), "sizes"),
+        sizes=sizes,
+        sizes_beside=beside,
     )
     if config.protocol == 2 and not config.unseen_layouts:
         raise UserError(
@@ -281,6 +278,13 @@ _TOP_LEVEL = (
     ),
     *("wandb", "safe", "filters", "sizes"),
 )
+
+
+def _sizes(value: Any) -> tuple[bool, Path | None]:
+    """Whether, and beside whose: ``true``, or ``{beside: a results root}``."""
+    if not isinstance(value, Mapping):
+        return flag(value, "sizes"), None
+    return True, root(Section(value, "sizes", ("beside",)).required("beside"), "sizes.beside")
 
 
 def _tasks(value: Any, where: str) -> dict[str, TaskVariant | ForeignTask | None]:
@@ -407,29 +411,6 @@ def _outside(value: Any, where: str) -> Outside:
         integer(section.required("steps"), f"{where}.steps", 1),
         mapping(section.get("hyperparameters", {}), f"{where}.hyperparameters"),
     )
-
-
-def _root(value: Any, where: str) -> Path:
-    if not isinstance(value, str) or not _ROOT.fullmatch(value):
-        raise UserError(
-            f"{where} must be a path of plain names, from here, from above (../) or from / "
-            f"(no hidden folder, no '..' but at the start), not {show(value)}"
-        )
-    path = Path(value)
-    place = path.resolve()
-    if path.parts[0] in _SOURCES or _among_sources(place):
-        raise UserError(f"{where} = {value!r} lies among the sources; choose another folder")
-    if place in (REPOSITORY, *REPOSITORY.parents, Path.cwd(), *Path.cwd().parents):
-        raise UserError(f"{where} = {value!r} contains the repository; choose a folder beside it")
-    if path.exists() and not path.is_dir():
-        raise UserError(f"{where} = {value!r} is a file; choose a folder")
-    return path
-
-
-def _among_sources(place: Path) -> bool:
-    inside = place.is_relative_to(REPOSITORY)
-    first = place.relative_to(REPOSITORY).parts[:1] if inside else ()
-    return any(name in _SOURCES or name.startswith(".") for name in first)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,13 @@ from safemr.report import statistics
 from safemr.report.tables import ABSENT, FEW, Table, plus_minus
 
 
-def table(sizes: pd.DataFrame) -> Table:
+def table(sizes: pd.DataFrame, others: Others | None = None) -> Table:
     """A row a task and certificate, those of one variant together.
 
     sizes: `safemr.measure.oracle.measured_sizes`, or what was read of its CSV.
     """
+    if others:
+        sizes = pd.concat([sizes, others.sizes], ignore_index=True)
     rows: list[dict[str, Any]] = []
     named = sizes.assign(name=sizes["variant"].fillna(sizes["certificate"]))
     for (task, name), part in named.groupby(["task", "name"], sort=False):
@@ -70,15 +73,70 @@ def table(sizes: pd.DataFrame) -> Table:
         "the share and the least g are of the worst run. The oracle is the feasible member of the "
         "paper's family with the least area, in the box in which the learners keep zeta."
     )
+    if others and others.variants:
+        caption += f" Of another configuration's runs (under {others.root}): "
+        caption += ", ".join(others.variants) + "."
     return Table("sizes", caption, data, display, [FEW])
 
 
-def merged(sizes: pd.DataFrame, flown: Sequence[Path]) -> pd.DataFrame:
+@dataclass(frozen=True)
+class Others:
+    """Certificates of the runs of another configuration that this one has no variant for.
+
+    root: its results root; sizes: its rows for them, of `safemr.measure.oracle.COLUMNS`; flown:
+    the flights of all its runs on these tasks, by task, variant, seed, metric and value.
+    """
+
+    root: Path
+    sizes: pd.DataFrame
+    flown: pd.DataFrame
+
+    @property
+    def variants(self) -> list[str]:
+        return list(self.sizes["variant"].unique())
+
+    @classmethod
+    def read(cls, sizes: Path, *flown: Path, ours: pd.DataFrame) -> Others:
+        """What ``ours``, sizes as `table` takes them, lacks on its tasks.
+
+        sizes, flown: files that the pipeline made under the summary of the other's results root.
+        Raises UserError where one is missing, or where sizes were measured for other decisions,
+        which would make areas and feasibility of the two incomparable.
+        """
+        root = sizes.parent.parent
+        for path in (sizes, *flown):
+            if not path.exists():
+                raise UserError(
+                    f"sizes.beside: {path} is missing; make the results under {root} first, or "
+                    "say sizes: true"
+                )
+        theirs, tasks = pd.read_csv(sizes), list(ours["task"].unique())
+        for task in tasks:
+            here, there = (
+                one.loc[(one["task"] == task) & (one["certificate"] == ORACLE), "area"].to_list()
+                for one in (ours, theirs)
+            )
+            if len(here) != len(there) or not np.allclose(here, there):
+                raise UserError(
+                    f"sizes.beside: on {task} the least feasible certificate has the unsafe area "
+                    f"{here} here and {there} under {root}: the decisions are not the same"
+                )
+        known = set(zip(ours["task"], ours["variant"], strict=True))
+        lacking = [
+            task in tasks and isinstance(variant, str) and (task, variant) not in known
+            for task, variant in zip(theirs["task"], theirs["variant"], strict=True)
+        ]
+        return cls(root, theirs[lacking], pd.concat(map(pd.read_csv, flown)))
+
+
+def merged(sizes: pd.DataFrame, flown: pd.DataFrame) -> pd.DataFrame:
     """Area and feasibility of every run's certificate with the return and the violating steps of
-    its final policy on unseen layouts: task, variant, seed, area, feasible, return, violating."""
+    its final policy on unseen layouts: task, variant, seed, area, feasible, return, violating.
+
+    sizes: as in `table`; flown: task, variant, seed, metric, value.
+    """
     runs = sizes.dropna(subset="variant")
-    scores = pd.concat([pd.read_csv(path) for path in flown], ignore_index=True)
-    wide = scores.pivot_table(
+    wide = flown.pivot_table(
         index=["task", "variant", "seed"], columns="metric", values="value"
     ).reset_index()
     found = runs.astype({"seed": int}).merge(wide, on=["task", "variant", "seed"])

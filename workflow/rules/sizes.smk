@@ -10,14 +10,22 @@ SIZED = [
     and declared_certificate(run.config["algorithm"]["name"]) == "energy"
 ]
 SIZED_TASKS = [task for task in CONFIG.tasks if any(run.task == task for run in SIZED)]
+SIZES = f"{SUMMARY}/sizes.csv"
+# The same of another configuration, its sizes first. What is missing of them is for the script to say.
+SIZES_BESIDE = [
+    CONFIG.sizes_beside / Path(made).relative_to(RESULTS)
+    for made in [SIZES, *expand(rules.unseen_layouts.output[0], task=SIZED_TASKS)]
+    if CONFIG.sizes_beside
+]
 
 
 rule sizes:
     input:
         records=record_files(SIZED),
         flown=expand(rules.unseen_layouts.output[0], task=SIZED_TASKS),
+        beside=[file for file in SIZES_BESIDE if file.exists()],
     output:
-        sizes=f"{SUMMARY}/sizes.csv",
+        sizes=SIZES,
         table=expand(f"{RESULTS}/tables/sizes.{{end}}", end=["csv", "tex"]),
         markdown=report(
             f"{RESULTS}/tables/sizes.md", caption="../report/sizes.rst", category="Tables"
@@ -35,6 +43,7 @@ rule sizes:
         root=RESULTS,
         folders=[run.path.as_posix() for run in SIZED],
         tasks=SIZED_TASKS,
+        beside=[file.as_posix() for file in SIZES_BESIDE],
         lacking=without_policy(SIZED),
         sources=sources("sizes"),
     message:

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pandas as pd
+
 from safemr.errors import reported_errors
 from safemr.measure.oracle import ORACLE, measured_sizes
 from safemr.measure.store import Measurements
@@ -14,8 +16,12 @@ with reported_errors():
     found = measured_sizes(
         Measurements(params.root), [Path(params.root, folder) for folder in params.folders]
     )
+    others = params.beside and sizes.Others.read(*map(Path, params.beside), ours=found)
 found.to_csv(output.sizes, index=False)
-sizes.table(found).write(Path(output.markdown).parent)
+sizes.table(found, others).write(Path(output.markdown).parent)
 yardsticks = found[found["certificate"] == ORACLE].set_index("task")["area"].to_dict()
-figure = against_size(sizes.merged(found, snakemake.input.flown), params.tasks, yardsticks)
+points = sizes.merged(found, pd.concat(map(pd.read_csv, snakemake.input.flown)))
+if others:
+    points = pd.concat([points, sizes.merged(others.sizes, others.flown)])
+figure = against_size(points, params.tasks, yardsticks)
 style.save(figure, Path(output.pdf).with_suffix(""))
