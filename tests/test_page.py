@@ -186,6 +186,15 @@ def test_what_was_not_made_has_no_heading(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_a_table_without_rows_is_shown(tmp_path: Path) -> None:
+    """Such as the power of comparisons, where nothing is recorded to compare a method with."""
+    table(tmp_path / "tables", "power", {"task": [], "minus": []})
+    assert make(tmp_path / "report.html", tmp_path / "tables").texts["cell"][:2] == [
+        "task",
+        "minus",
+    ]
+
+
 def test_every_table_and_figure_of_the_rules_has_a_place() -> None:
     """What a rule makes and no question names would stand at the end, which is for others' own."""
     text = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
@@ -346,7 +355,7 @@ def test_the_page_in_a_browser(name: str, tmp_path: Path) -> None:
             browser(press.format(index))
             orders.append(column())
         assert orders == ["BCA", "CBA", "BAC", "ABC"]  # a dash stays last
-        assert browser("document.querySelector('[aria-sort]').textContent") == "algorithm"
+        assert browser("document.querySelector('[aria-sort]').innerText") == "algorithm"
         assert "10 ± 2" in browser("document.querySelector('#table-results').innerText")
 
         film = "document.querySelector('picture img')"

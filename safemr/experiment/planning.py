@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from safemr.experiment.catalogue import Algorithm, hyperparameters, load_algorit
 from safemr.experiment.catalogue import algorithm_names as algorithm_names
 from safemr.experiment.config import Config, Variant
 from safemr.experiment.roles import Variants
+from safemr.experiment.sections import told
 from safemr.experiment.task_entries import ForeignTask as ForeignTask
 from safemr.experiment.task_entries import check_name as check_name
 from safemr.experiment.task_entries import describe_foreign as describe_foreign
@@ -95,22 +96,14 @@ class Plan:
         of: dict[str, set[int]] = {}
         for run in self.navigation:
             of.setdefault(run.variant, set()).add(run.seed)
-        told = {variant: _listed(seeds) for variant, seeds in of.items()}
-        ((most, _),) = Counter(told.values()).most_common(1) or [("", 0)]
+        said = {variant: told(seeds) for variant, seeds in of.items()}
+        ((most, _),) = Counter(said.values()).most_common(1) or [("", 0)]
         others: dict[str, list[str]] = {}
-        for variant, seeds in told.items():
+        for variant, seeds in said.items():
             if seeds != most:
                 others.setdefault(seeds, []).append(variant)
         rest = "; ".join(f"{', '.join(names)}: {seeds}" for seeds, names in others.items())
         return f"{most} ({rest})" if rest else most
-
-
-def _listed(seeds: Iterable[int]) -> str:
-    """0 to 4, or 0, 1, 3."""
-    numbers = sorted(seeds)
-    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
-        return f"{numbers[0]} to {numbers[-1]}"
-    return ", ".join(map(str, numbers))
 
 
 def check_setting(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from safemr.errors import UserError, show
@@ -107,3 +107,11 @@ def seeds_in(value: Any, where: str) -> tuple[int, ...]:
     seeds = tuple(integer(item, f"each of {where}", 0, LARGEST_SEED) for item in items)
     distinct(seeds, where)
     return seeds
+
+
+def told(seeds: Iterable[int]) -> str:
+    """For a reader, in their order: ``0 to 4``, or ``0, 1, 3``."""
+    numbers = sorted(seeds)
+    if len(numbers) > 2 and numbers[-1] - numbers[0] == len(numbers) - 1:
+        return f"{numbers[0]} to {numbers[-1]}"
+    return ", ".join(map(str, numbers))

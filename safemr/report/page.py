@@ -159,7 +159,8 @@ class Panel:
     @cached_property
     def numeric(self) -> tuple[bool, ...]:
         """[columns] whether most cells that say something begin with a number."""
-        columns = zip(*self.content.rows, strict=True)
+        # Not `zip`, which finds no columns where there are no rows.
+        columns = [[row[i] for row in self.content.rows] for i in range(len(self.content.head))]
         said = [[cell for cell in column if cell not in ("", ABSENT)] for column in columns]
         return tuple(
             2 * sum(printed.number(cell) is not None for cell in cells) > len(cells)

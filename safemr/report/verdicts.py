@@ -9,6 +9,7 @@ from typing import get_args
 
 import pandas as pd
 
+from safemr.experiment.sections import told
 from safemr.report.findings import Verdict
 
 # What a row says -> the claims of `safemr.report.claims` that it is about, by their names up to a
@@ -85,9 +86,8 @@ def _part(parts: Mapping[str, str], claim: str) -> str:
 
 
 def _caption(runs: pd.DataFrame) -> str:
-    seeds = sorted(runs["seed"].unique())
-    together = len(seeds) > 2 and seeds[-1] - seeds[0] == len(seeds) - 1
-    shown = f"{seeds[0]} to {seeds[-1]}" if together else ", ".join(map(str, seeds))
+    seeds = runs["seed"].unique()
+    shown = told(seeds)
     each = runs.groupby(["task", "variant"])["seed"].nunique()
     if each.min() < len(seeds):
         shown += f", {each.min()} to {each.max()} of them each" if each.max() > each.min() else ""
