@@ -697,10 +697,18 @@ def test_the_default_is_the_papers_grid_and_two_certificates_more() -> None:
     beside = {"FAC-oracle", "SafeMR-guarded"}  # the two are not the paper's
     papers = [run for run in plan.navigation if run.variant not in beside]
     assert len(papers) == 7 * 4 * 5
-    assert len(plan.navigation) == 140 + 2 * 4 * 4
+    assert len(plan.navigation) == 140 + 2 * 4 * 5
     assert len(plan.aircraft) == 4 * 10
-    assert len(plan.trained) == 172 + 2 * 5 + 40
-    assert plan.seeds_told == "0 to 4 (FAC-oracle, SafeMR-guarded: 0 to 3)"
+    assert len(plan.trained) == 180 + 2 * 5 + 40
+    assert plan.seeds_told == "0 to 4"
+
+
+def test_captions_tell_whose_seeds_are_others() -> None:
+    raw = yaml.load(DEFAULT.read_text(), StrictLoader)
+    for name in ("FAC-oracle", "SafeMR-guarded"):
+        raw["algorithms"][name]["seeds"] = [0, 2]
+    told = planning.resolve(config.parse(raw)).seeds_told
+    assert told == "0 to 4 (FAC-oracle, SafeMR-guarded: 0, 2)"
 
 
 def test_plans_are_remembered_until_something_changes(

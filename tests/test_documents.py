@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from scipy.special import stdtrit
 
 from safemr.experiment import planning
@@ -310,6 +311,44 @@ def test_what_two_looks_find_where_nothing_is(level: float, share: float) -> Non
     assert 100 * np.mean(found) == pytest.approx(share, abs=0.05)
     assert f"at {100 * level:.0f}%" in text_of(REPRODUCIBILITY)
     assert f"in {share}%" in text_of(REPRODUCIBILITY)
+
+
+def test_the_trials_of_the_forms_and_what_the_rule_chooses() -> None:
+    page = (ROOT / "docs/tuning.md").read_text()
+    flown = pd.read_csv(ROOT / "results/forms_tuning/tables/unseen_layouts.csv")
+    flown = flown.set_index(["task", "variant"])
+    goal, push = "Pillars-0.15-Goal", "Hazards-0.30-Push"
+    forms = [(name, form) for name in PAIR for form in ("", "-literal", "-released")]
+    travels, chosen = ("0.1", "0.33", "1", "3.3"), {}
+
+    def trial(task: str, name: str, form: str, travel: str) -> pd.Series | None:
+        plain = not form and travel == "0.33"  # the second pilot's
+        key = (task, f"{name}{form}" + f"-{travel}" * (not plain))
+        return flown.loc[key] if key in flown.index else None
+
+    for name, form in forms:
+        for travel in travels:
+            found = [trial(task, name, form, travel) for task in (goal, push)]
+            if all(run is not None and run["violating_episodes"] <= 1 for run in found):
+                chosen[name, form] = travel
+    grid = yaml.safe_load((ROOT / "config/forms.yaml").read_text())["algorithms"]
+    for (name, form), travel in chosen.items():
+        entry = grid[f"{name}{form}" if (name, form) != ("JointSIS", "") else "JointSIS-floored"]
+        assert str(entry.get("certificate_travel", 0.33)) == travel
+    assert len(chosen) == len(grid)
+    for travel in travels:
+        row = [travel]
+        for name, form in forms:
+            run = trial(goal, name, form, travel)
+            text = "–" if run is None else f"{run['return']:.1f} ({run['violating_episodes']})"
+            row.append(f"**{text}**" if chosen[name, form] == travel else text)
+        assert f"| {' | '.join(row)} |" in page
+    returns = [trial(push, *key, travel) for key, travel in chosen.items()]
+    assert not any(run["violating_episodes"] for run in returns)
+    said = "{:.1f}, {:.1f}, {:.1f}, {:.1f}, {:.1f} and {:.1f}"
+    assert said.format(*(run["return"] for run in returns)) in text_of(page)
+    other = trial(push, "SafeMR", "", "1")
+    assert (round(other["return"], 1), other["violating_episodes"]) == (11.2, 2)
 
 
 def test_the_two_certificates_beside_the_papers_are_told_as_flown() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -37,7 +38,10 @@ def against_size(
 
     points: `safemr.report.sizes.merged`; oracles: task -> area of its oracle.
     """
-    figure = style.new_figure(style.text_width(len(tasks)), 3.6)
+    variants = style.ordered(points["variant"].unique())
+    columns = style.legend_columns([*variants, "oracle", "not feasible"])
+    rows = math.ceil((len(variants) + 2) / columns)  # of the legend
+    figure = style.new_figure(style.text_width(len(tasks)), 3.2 + 0.2 * rows)
     axes = figure.subplots(2, len(tasks), squeeze=False, sharex="col")
     for column, task in enumerate(tasks):
         chosen = points[points["task"] == task]
@@ -51,13 +55,11 @@ def against_size(
         lower.set_xlabel("unsafe area (m$^2$)")
     axes[0, 0].set_ylabel("return (per episode)")
     axes[1, 0].set_ylabel("violating steps an episode\n(linear to 0.1, then log)")
-    variants = style.ordered(points["variant"].unique())
     handles = style.marks(variants)
     handles.append(Line2D([], [], color=style.INK, lw=0.7, ls=(0, (3, 2)), label="oracle"))
     handles.append(
         Line2D([], [], color=style.INK, marker="o", mfc="none", ls="none", ms=4,
                label="not feasible")
     )  # fmt: skip
-    columns = style.legend_columns([*variants, "oracle", "not feasible"])
     style.legend_below(figure, handles, columns)
     return figure
