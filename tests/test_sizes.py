@@ -24,7 +24,8 @@ def certificates() -> pd.DataFrame:
     def row(name: str, area: float, infeasible: int = 0, variant: str | None = None,
             seed: int | None = None) -> tuple[object, ...]:  # fmt: skip
         worst = 0.01 * infeasible if infeasible else np.nan
-        return TASK, name, variant, seed, 0.1, 1.0, 2.0, area, 1000, infeasible, worst
+        made = None if variant is None else variant == "A"
+        return TASK, name, variant, seed, 0.1, 1.0, 2.0, area, 1000, infeasible, worst, made
 
     rows = [row("oracle", 0.5), row("phi_h", 1.5, 2)]
     rows += [row(f"A (seed {seed})", 1.0 + seed, seed == 2, "A", seed) for seed in range(3)]
@@ -57,6 +58,7 @@ def test_runs_meet_their_flights(tmp_path: Path) -> None:
     assert len(points) == 4  # PPO-L has no certificate, phi_h no flight
     assert points.set_index(["variant", "seed"]).loc[("A", 2), "return"] == 12.0
     assert points["feasible"].tolist() == [True, True, False, True]
+    assert points["regularized"].tolist() == [True, True, True, False]
     figure = against_size(points, [TASK], {TASK: 0.5})
     upper = figure.axes[0]
     drawn = [line for line in upper.lines if line.get_marker() not in ("None", None, "")]
@@ -70,7 +72,7 @@ def beside(folder: Path, area: float = 0.5) -> list[Path]:
     folder.mkdir(exist_ok=True)
     theirs = certificates().head(2).copy()
     theirs["area"] = [area, 1.5]
-    rows = [(TASK, f"{v} (seed {s})", v, s, 0.1, 1.0, 2.0, 0.3, 1000, 0, np.nan)
+    rows = [(TASK, f"{v} (seed {s})", v, s, 0.1, 1.0, 2.0, 0.3, 1000, 0, np.nan, True)
             for v, s in [("A", 7), ("C", 0), ("C", 1)]]  # fmt: skip
     pd.concat([theirs, pd.DataFrame(rows, columns=list(COLUMNS))]).to_csv(
         folder / "sizes.csv", index=False

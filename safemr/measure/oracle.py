@@ -35,7 +35,7 @@ ORACLE = "oracle"  # the certificate's name in tables
 GRID = {"cell": list(CELL), "bearings": BEARINGS, "spacing": SPACING}
 SEARCH = {"points": POINTS, "zooms": ZOOMS}
 COLUMNS = ("task", "certificate", "variant", "seed", *PAPER.names, "area", "encounters",
-           "infeasible", "worst")  # fmt: skip
+           "infeasible", "worst", "regularized")  # fmt: skip
 
 
 class Yardstick:
@@ -111,7 +111,8 @@ def measured_sizes(measurements: Measurements, folders: Sequence[Path]) -> pd.Da
     records' own.
 
     All are judged over decisions as the records of the task make them. Records without a
-    certificate of the paper's family give no row; ``variant`` and ``seed`` are those of a record.
+    certificate of the paper's family give no row; ``variant``, ``seed`` and ``regularized``, whether
+    the loss that made it had weights [a, b], are those of a record.
     """
     yardsticks: dict[tuple[str, Interface], Yardstick] = {}
     rows: list[dict[str, Any]] = []
@@ -129,5 +130,11 @@ def measured_sizes(measurements: Measurements, folders: Sequence[Path]) -> pd.Da
             yardsticks[key] = yardstick = Yardstick(record.task, interface)
             rows += yardstick.references(measurements)
         row = yardsticks[key].row(measurements, certificate)
-        learned.append({**row, "variant": record.variant, "seed": record.seed})
+        values = record.config["algorithm"]["hyperparameters"]
+        regularized = any(values.get(weight) for weight in ("a", "b"))
+        learned.append(
+            {
+                **row, "variant": record.variant, "seed": record.seed, "regularized": regularized
+            }
+        )  # fmt: skip
     return pd.DataFrame([*rows, *learned], columns=COLUMNS)

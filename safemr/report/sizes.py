@@ -79,6 +79,9 @@ def table(sizes: pd.DataFrame, others: Others | None = None) -> Table:
     return Table("sizes", caption, data, display, [FEW])
 
 
+KEPT = ("task", "variant", "seed", "k", "area", "regularized")  # by `merged`
+
+
 @dataclass(frozen=True)
 class Others:
     """Certificates of the runs of another configuration that this one has no variant for.
@@ -131,7 +134,8 @@ class Others:
 
 def merged(sizes: pd.DataFrame, flown: pd.DataFrame) -> pd.DataFrame:
     """Area and feasibility of every run's certificate with the return and the violating steps of
-    its final policy on unseen layouts: task, variant, seed, area, feasible, return, violating.
+    its final policy on unseen layouts: task, variant, seed, k, area, regularized, feasible, return,
+    violating.
 
     sizes: as in `table`; flown: task, variant, seed, metric, value.
     """
@@ -142,7 +146,7 @@ def merged(sizes: pd.DataFrame, flown: pd.DataFrame) -> pd.DataFrame:
     found = runs.astype({"seed": int}).merge(wide, on=["task", "variant", "seed"])
     return pd.DataFrame(
         {
-            **{name: found[name] for name in ("task", "variant", "seed", "area")},
+            **{name: found[name] for name in KEPT},
             "feasible": found["infeasible"] == 0,
             "return": found["eval_return"],
             "violating": found["eval_cost_indicator"],

@@ -26,9 +26,16 @@ rule sizes:
         beside=[file for file in SIZES_BESIDE if file.exists()],
     output:
         sizes=SIZES,
-        table=expand(f"{RESULTS}/tables/sizes.{{end}}", end=["csv", "tex"]),
+        table=expand(
+            f"{RESULTS}/tables/{{name}}.{{end}}", name=["sizes", "regularizer"], end=["csv", "tex"]
+        ),
         markdown=report(
             f"{RESULTS}/tables/sizes.md", caption="../report/sizes.rst", category="Tables"
+        ),
+        regularizer=report(
+            f"{RESULTS}/tables/regularizer.md",
+            caption="../report/regularizer.rst",
+            category="Tables",
         ),
         pdf=f"{FIGURES}/return_against_size.pdf",
         png=report(
@@ -43,6 +50,8 @@ rule sizes:
         root=RESULTS,
         folders=[run.path.as_posix() for run in SIZED],
         tasks=SIZED_TASKS,
+        method=METHOD,
+        ablation=ABLATION,
         beside=[file.as_posix() for file in SIZES_BESIDE],
         lacking=without_policy(SIZED),
         sources=sources("sizes"),

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import pandas as pd
 
+from safemr import paper
 from safemr.errors import reported_errors
 from safemr.measure.oracle import ORACLE, measured_sizes
 from safemr.measure.store import Measurements
-from safemr.report import sizes
+from safemr.report import regularizer, sizes
 from safemr.report.figures import style
 from safemr.report.figures.sizes import against_size
 
@@ -23,5 +24,7 @@ yardsticks = found[found["certificate"] == ORACLE].set_index("task")["area"].to_
 points = sizes.merged(found, pd.concat(map(pd.read_csv, snakemake.input.flown)))
 if others:
     points = pd.concat([points, sizes.merged(others.sizes, others.flown)])
+ablation = paper.ABLATION if paper.ABLATION in set(points["variant"]) else params.ablation
+regularizer.table(points, params.tasks, params.method, ablation).write(Path(output.markdown).parent)
 figure = against_size(points, params.tasks, yardsticks)
 style.save(figure, Path(output.pdf).with_suffix(""))

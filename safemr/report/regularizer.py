@@ -1,0 +1,100 @@
+"""Is it the regularizer, or the size of the unsafe set that it leads to?
+
+Return against the unsafe area of the run's final certificate, with and without weights [a, b] in
+the loss: the rule stands in docs/claims.md, "The second protocol".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from safemr.report import statistics
+from safemr.report.second_protocol import PRIMARY_LEVEL
+from safemr.report.statistics import Estimate
+from safemr.report.tables import ABSENT, FEW, Table
+
+SHARE = 0.5  # of the difference to be explained: what the size may leave over
+
+
+def at_equal_size(points: pd.DataFrame) -> Estimate:
+    """gamma of return = c0 + c1 A + c2 A^2 + gamma R, what the regularizer adds at equal area A.
+
+    points: runs on one task, with area, regularized (R) and return. nan where they are too few, or
+    all alike in R.
+    """
+    area = points["area"].to_numpy(float)
+    factors = np.column_stack([area, area**2, points["regularized"].to_numpy(float)])
+    return statistics.linear_effects(factors, points["return"].to_numpy(float))[-1]
+
+
+def answer(gap: Estimate, added: Estimate) -> str:
+    """What the rule says of SafeMR's difference to JointSIS and of gamma."""
+    if np.isnan(gap.low) or np.isnan(added.low):
+        return ABSENT
+    if gap.low <= 0:
+        return "nothing to explain"
+    if max(-added.low, added.high) <= SHARE * gap.mean:
+        return "the size"
+    if added.low > 0:
+        return "the regularizer, too"
+    return "less than the size promises" if added.high < 0 else "not decided"
+
+
+def table(points: pd.DataFrame, tasks: Sequence[str], method: str, ablation: str) -> Table:
+    """A row a task.
+
+    points: `safemr.report.sizes.merged`; method, ablation: the variants whose difference is to be
+    explained.
+    """
+    rows: list[dict[str, Any]] = []
+    for task in tasks:
+        runs = points[(points["task"] == task) & (points["k"] > 0)]  # all but phi_0
+        ours, theirs = (
+            runs.loc[runs["variant"] == name, "return"].to_numpy(float)
+            for name in (method, ablation)
+        )
+        gap = statistics.difference_interval(ours, theirs, PRIMARY_LEVEL)
+        added = at_equal_size(runs)
+        rows.append(
+            {
+                "task": task, "runs": len(runs), "regularized": int(runs["regularized"].sum()),
+                "certificates": runs["variant"].nunique(),
+                "difference": gap.mean, "difference_low": gap.low, "difference_high": gap.high,
+                "added": added.mean, "added_low": added.low, "added_high": added.high,
+                "answer": answer(gap, added),
+            }
+        )  # fmt: skip
+
+    def shown(mean: float, low: float, high: float) -> str:
+        if np.isnan(mean):
+            return ABSENT
+        return f"{mean:.2f}" if np.isnan(low) else f"{mean:.2f} [{low:.2f}, {high:.2f}]"
+
+    display = pd.DataFrame(
+        [
+            [
+                row["task"], f"{row['runs']} of {row['certificates']}", str(row["regularized"]),
+                *(
+                    shown(*(row[f"{name}{end}"] for end in ("", "_low", "_high")))
+                    for name in ("difference", "added")
+                ),
+                row["answer"],
+            ]
+            for row in rows
+        ],
+        columns=["task", "runs of certificates", "with [a, b]", f"{method} minus {ablation}",
+                 "with [a, b] minus without, at equal size", "what explains it"],
+    )  # fmt: skip
+    caption = (
+        "Is it the regularizer, or the size of the unsafe set? "
+        f"{method} minus {ablation}: returns on unseen layouts, with Welch's "
+        f"{100 * PRIMARY_LEVEL:g}% interval. At equal size: by least squares over the runs of all "
+        "certificates with a speed term, return on unsafe area, its square and whether [a, b] are "
+        "in the loss; 95% t interval. The size: that interval lies within half of the difference; "
+        "rule in docs/claims.md."
+    )
+    return Table("regularizer", caption, pd.DataFrame(rows), display, [FEW])

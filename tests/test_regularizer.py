@@ -1,0 +1,79 @@
+"""Whether the regularizer or the size explains a difference: a fit whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from safemr.report import regularizer
+from safemr.report.statistics import Estimate
+
+AREAS = {"SafeMR": 1.0, "JointSIS": 1.3, "SafeMR-literal": 0.9, "JointSIS-literal": 1.0,
+         "FAC-phih": 1.4, "FAC-oracle": 0.5, "SafeMR-guarded": 0.6}  # fmt: skip
+
+
+def runs(added: float, noise: float = 0.0, seed: int = 0, seeds: int = 5) -> pd.DataFrame:
+    """Returns 30 - 9 A - A^2, and ``added`` where [a, b] are in the loss; phi_0 apart from that."""
+    random = np.random.default_rng(seed)
+    rows = [
+        ("T", variant, number, 1.0, area + 0.01 * number, variant.startswith("SafeMR"))
+        for variant, area in AREAS.items()
+        for number in range(seeds)
+    ]
+    points = pd.DataFrame(rows, columns=["task", "variant", "seed", "k", "area", "regularized"])
+    points["return"] = (
+        30 - 9 * points["area"] - points["area"] ** 2 + added * points["regularized"]
+    ) + noise * random.normal(size=len(points))
+    phi_0 = points.head(1).assign(variant="FAC-phi0", k=0.0, area=0.0, **{"return": 500.0})
+    return pd.concat([points, phi_0], ignore_index=True)
+
+
+@pytest.mark.parametrize("added", [0.0, 1.5, -2.0])
+def test_what_is_added_at_equal_size_is_found(added: float) -> None:
+    found = regularizer.at_equal_size(runs(added).query("k > 0"))
+    assert found.mean == pytest.approx(added, abs=1e-8)
+
+
+def test_the_interval_covers_the_truth() -> None:
+    covered = 0
+    for seed in range(400):
+        found = regularizer.at_equal_size(runs(0.7, noise=1.0, seed=seed).query("k > 0"))
+        covered += found.low <= 0.7 <= found.high
+    assert covered / 400 == pytest.approx(0.95, abs=0.03)
+
+
+GAP, NAN = Estimate(3.0, 1.0, 5.0, 5), float("nan")
+
+
+@pytest.mark.parametrize(
+    ("gap", "ends", "said"),
+    [
+        (GAP, (-1.4, 1.4), "the size"),
+        (GAP, (0.2, 1.4), "the size"),  # it adds, and less than half of what is to be explained
+        (GAP, (0.2, 1.6), "the regularizer, too"),
+        (GAP, (-1.6, -0.2), "less than the size promises"),
+        (GAP, (-0.2, 1.6), "not decided"),
+        (Estimate(1.0, -0.1, 2.1, 5), (0.5, 0.6), "nothing to explain"),
+        (GAP, (NAN, NAN), "–"),
+        (Estimate(3.0, NAN, NAN, 1), (0.5, 0.6), "–"),
+    ],
+)
+def test_the_answer_follows_the_rule(gap: Estimate, ends: tuple[float, float], said: str) -> None:
+    assert regularizer.answer(gap, Estimate(sum(ends) / 2, *ends, 5)) == said
+
+
+def test_the_table_leaves_out_what_has_no_speed_term() -> None:
+    made = regularizer.table(runs(0.0, noise=0.2), ["T"], "SafeMR", "JointSIS")
+    row = made.data.iloc[0]
+    assert (row["runs"], row["certificates"], row["regularized"]) == (35, 7, 15)
+    assert row["answer"] == "the size"
+    assert made.display.iloc[0, 1] == "35 of 7"
+
+
+def test_single_runs_are_shown_without_intervals() -> None:
+    few = runs(0.0, noise=0.2, seeds=1)
+    row = regularizer.table(few[few["variant"].isin(["SafeMR", "JointSIS"])], ["T"], "SafeMR",
+                            "JointSIS").display.iloc[0]  # fmt: skip
+    assert row.tolist()[3:] == [f"{row.iloc[3]}", "–", "–"]
+    assert "[" not in row.iloc[3]
