@@ -111,8 +111,8 @@ def measured_sizes(measurements: Measurements, folders: Sequence[Path]) -> pd.Da
     records' own.
 
     All are judged over decisions as the records of the task make them. Records without a
-    certificate of the paper's family give no row; ``variant``, ``seed`` and ``regularized``, whether
-    the loss that made it had weights [a, b], are those of a record.
+    certificate of the paper's family give no row; ``variant``, ``seed`` and ``regularized``,
+    whether the loss that made it had weights [a, b], are those of a record.
     """
     yardsticks: dict[tuple[str, Interface], Yardstick] = {}
     rows: list[dict[str, Any]] = []
