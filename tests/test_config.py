@@ -739,9 +739,12 @@ def test_sizes_are_drawn_against_flights_on_unseen_layouts() -> None:
 
 def test_sizes_may_stand_beside_those_of_another_root() -> None:
     assert config.parse(VALID | {"sizes": True}).sizes_beside is None
-    both = config.parse(VALID | {"sizes": {"beside": "results"}})
+    elsewhere = VALID | {"results_root": "results/mine"}
+    both = config.parse(elsewhere | {"sizes": {"beside": "results"}})
     assert both.sizes
     assert both.sizes_beside == Path("results")
+    with pytest.raises(UserError, match="own results_root"):
+        config.parse(VALID | {"sizes": {"beside": "results"}, "results_root": "results"})
     for wrong in ({}, {"besides": "results"}, {"beside": ""}, {"beside": "config"}, "yes"):
         with pytest.raises(UserError, match="sizes"):
             config.parse(VALID | {"sizes": wrong})

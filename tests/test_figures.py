@@ -68,9 +68,13 @@ def test_the_shipped_variants_have_distinct_looks():
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_no_two_algorithms_of_a_configuration_look_alike(path: Path):
-    plan = planning.resolve(config.load([CONFIGS / "config.yaml", path]))
+    chosen = config.load([CONFIGS / "config.yaml", path])
+    plan = planning.resolve(chosen)
     looks: dict[str, str] = {}
-    for run in plan.runs:
+    runs = list(plan.runs)
+    if chosen.sizes_beside:  # whose certificates stand in the same figure
+        runs += planning.resolve(config.load([CONFIGS / "config.yaml"])).runs
+    for run in runs:
         if "[" not in run.variant:  # points of the sensitivity grid have looks of their own
             other = looks.setdefault(str(style.look(run.variant)), run.variant)
             assert other == run.variant, f"{other} and {run.variant} look alike"

@@ -67,26 +67,34 @@ def test_runs_meet_their_flights(tmp_path: Path) -> None:
     assert [line.get_xdata().tolist() for line in hollow] == [[3.0]]
 
 
-def beside(folder: Path, area: float = 0.5) -> list[Path]:
-    """The files of another configuration: a run of A and two of C, and flights of all three."""
+def beside(folder: Path, area: float = 0.5, gain: float = 0.0) -> list[Path]:
+    """The files of another configuration: two runs of A, of which one is ours, and two of C."""
     folder.mkdir(exist_ok=True)
     theirs = certificates().head(2).copy()
     theirs["area"] = [area, 1.5]
+    runs = [("A", 7), ("A", 0), ("C", 0), ("C", 1)]
     rows = [(TASK, f"{v} (seed {s})", v, s, 0.1, 1.0, 2.0, 0.3, 1000, 0, np.nan, True)
-            for v, s in [("A", 7), ("C", 0), ("C", 1)]]  # fmt: skip
+            for v, s in runs]  # fmt: skip
     pd.concat([theirs, pd.DataFrame(rows, columns=list(COLUMNS))]).to_csv(
         folder / "sizes.csv", index=False
     )
-    flown = [(TASK, v, s, metric, 5.0) for v, s in [("A", 7), ("C", 0), ("C", 1)]
-             for metric in ("eval_return", "eval_cost_indicator")]  # fmt: skip
+    flown = [(TASK, v, s, metric, 10.0 + gain)
+             for v, s in runs for metric in ("eval_return", "eval_cost_indicator")]  # fmt: skip
     columns = ["task", "variant", "seed", "metric", "value"]
     pd.DataFrame(flown, columns=columns).to_csv(folder / "flown.csv", index=False)
     return [folder / "sizes.csv", folder / "flown.csv"]
 
 
-def test_certificates_of_another_configuration_stand_beside_these(tmp_path: Path) -> None:
+@pytest.fixture
+def flown(tmp_path: Path) -> pd.DataFrame:
+    return pd.read_csv(scores(tmp_path / "ours.csv"))
+
+
+def test_certificates_of_another_configuration_stand_beside_these(
+    tmp_path: Path, flown: pd.DataFrame
+) -> None:
     ours = certificates()
-    others = sizes.Others.read(*beside(tmp_path / "summary"), ours=ours)
+    others = sizes.Others.read(*beside(tmp_path / "summary"), ours=ours, flown=flown)
     assert others.variants == ["C"]  # A is ours, and not mixed with theirs
     made = sizes.table(ours, others)
     assert made.data.set_index("certificate")["runs"].to_dict() == {
@@ -94,19 +102,37 @@ def test_certificates_of_another_configuration_stand_beside_these(tmp_path: Path
     }  # fmt: skip
     assert made.caption.endswith(f"Of another configuration's runs (under {tmp_path}): C.")
     points = sizes.merged(others.sizes, others.flown)
-    assert points[["variant", "seed", "return"]].values.tolist() == [["C", 0, 5.0], ["C", 1, 5.0]]
+    shown = points[["variant", "seed", "return"]].to_numpy().tolist()
+    assert shown == [["C", 0, 10.0], ["C", 1, 10.0]]
 
 
-def test_sizes_for_other_decisions_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"on Pillars-0.15-Goal .* the decisions are not the same"):
-        sizes.Others.read(*beside(tmp_path / "summary", area=0.6), ours=certificates())
+@pytest.mark.parametrize(
+    ("spoilt", "said"),
+    [
+        ({"area": 0.6}, "0.5000 here and 0.6000 under .*: give the task the same interface"),
+        ({"gain": 0.1}, "no run on Pillars-0.15-Goal has the same return here"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(
+    spoilt: dict[str, float], said: str, tmp_path: Path, flown: pd.DataFrame
+) -> None:
+    with pytest.raises(UserError, match=said):
+        sizes.Others.read(*beside(tmp_path / "s", **spoilt), ours=certificates(), flown=flown)
 
 
-def test_what_is_missing_of_another_configuration_is_named(tmp_path: Path) -> None:
-    files = beside(tmp_path / "summary")
-    files[1].unlink()
+def test_what_is_missing_of_another_configuration_is_named(
+    tmp_path: Path, flown: pd.DataFrame
+) -> None:
+    ours = certificates()
+    first, second = beside(tmp_path / "summary")
+    with pytest.raises(UserError, match="does not have Other-Task"):
+        sizes.Others.read(first, second, ours=ours.assign(task="Other-Task"), flown=flown)
+    pd.read_csv(first).drop(columns="regularized").to_csv(first, index=False)
+    with pytest.raises(UserError, match="has no column 'regularized'; make the results under"):
+        sizes.Others.read(first, second, ours=ours, flown=flown)
+    second.unlink()
     with pytest.raises(UserError, match=r"flown.csv is missing; make the results under"):
-        sizes.Others.read(*files, ours=certificates())
+        sizes.Others.read(first, second, ours=ours, flown=flown)
 
 
 def test_the_filters_figure_shows_every_flight() -> None:

@@ -189,6 +189,12 @@ def parse(raw: Any) -> Config:
     seeds = seeds_in(top.required("seeds"), "seeds")
     least = min(seeds)  # decides whose layouts those are that are not named
     sizes, beside = _sizes(top.get("sizes", False))
+    results = root(top.get("results_root", "results"), "results_root")
+    if beside and beside.resolve() == results.resolve():
+        raise UserError(
+            f"sizes.beside = {beside.as_posix()!r} is this configuration's own results_root: name "
+            "another's, or say sizes: true"
+        )
     mode = wandb.get("mode", "disabled")
     if mode not in WANDB_MODES:
         raise unknown("wandb mode", mode, WANDB_MODES)
@@ -219,7 +225,7 @@ def parse(raw: Any) -> Config:
             label: _outside(value, f"outside.{label}")
             for label, value in labelled(top.get("outside", {}), "outside")
         },
-        results_root=root(top.get("results_root", "results"), "results_root"),
+        results_root=results,
         figures_root=root(top.get("figures_root", "paper_figures"), "figures_root"),
         allow_missing=flag(top.get("allow_missing", False), "allow_missing"),
         wandb_mode=mode,

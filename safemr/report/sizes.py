@@ -71,7 +71,7 @@ def table(sizes: pd.DataFrame, others: Others | None = None) -> Table:
         "motions that the robot reaches from rest and their directions. Feasible: in every such "
         "motion, at every place of a grid around an obstacle, some action keeps the constraint; "
         "the share and the least g are of the worst run. The oracle is the feasible member of the "
-        "paper's family with the least area, in the box in which the learners keep zeta."
+        "paper's family with the least area, in the box in which the learners keep zeta by default."
     )
     if others and others.variants:
         caption += f" Of another configuration's runs (under {others.root}): "
@@ -99,37 +99,58 @@ class Others:
         return list(self.sizes["variant"].unique())
 
     @classmethod
-    def read(cls, sizes: Path, *flown: Path, ours: pd.DataFrame) -> Others:
-        """What ``ours``, sizes as `table` takes them, lacks on its tasks.
+    def read(cls, sizes: Path, *flights: Path, ours: pd.DataFrame, flown: pd.DataFrame) -> Others:
+        """What a configuration lacks on its tasks.
 
-        sizes, flown: files that the pipeline made under the summary of the other's results root.
-        Raises UserError where one is missing, or where sizes were measured for other decisions,
-        which would make areas and feasibility of the two incomparable.
+        sizes, flights: files that the pipeline made under the summary of the other's results root;
+        ours: this configuration's sizes, as `table` takes them; flown: its flights.
+        Raises UserError where a file is missing or old, where sizes were measured for other
+        decisions, or where a task has no run in both that flew alike: areas, feasibility and
+        returns of the two could then not be compared.
         """
         root = sizes.parent.parent
-        for path in (sizes, *flown):
+        remedy = f"make the results under {root} first, or say sizes: true"
+        for path in (sizes, *flights):
             if not path.exists():
-                raise UserError(
-                    f"sizes.beside: {path} is missing; make the results under {root} first, or "
-                    "say sizes: true"
-                )
-        theirs, tasks = pd.read_csv(sizes), list(ours["task"].unique())
+                raise UserError(f"sizes.beside: {path} is missing; {remedy}")
+        theirs, flown_there = pd.read_csv(sizes), pd.concat(map(pd.read_csv, flights))
+        if absent := [name for name in COLUMNS if name not in theirs]:
+            raise UserError(f"sizes.beside: {sizes} has no column {absent[0]!r}; {remedy}")
+        tasks = list(ours["task"].unique())
         for task in tasks:
             here, there = (
                 one.loc[(one["task"] == task) & (one["certificate"] == ORACLE), "area"].to_list()
                 for one in (ours, theirs)
             )
-            if len(here) != len(there) or not np.allclose(here, there):
+            if not there:
+                raise UserError(f"sizes.beside: {sizes} does not have {task}; say sizes: true")
+            if not np.allclose(here, there):
                 raise UserError(
                     f"sizes.beside: on {task} the least feasible certificate has the unsafe area "
-                    f"{here} here and {there} under {root}: the decisions are not the same"
+                    f"{here[0]:.4f} here and {there[0]:.4f} under {root}: give the task the same "
+                    "interface as there, or say sizes: true"
+                )
+            if not _flew_alike(flown, flown_there, task):
+                raise UserError(
+                    f"sizes.beside: no run on {task} has the same return here and under {root}, so "
+                    "that flights may be on other layouts: have a run of it here, too, with the "
+                    "same unseen_layouts, or say sizes: true"
                 )
         known = set(zip(ours["task"], ours["variant"], strict=True))
         lacking = [
             task in tasks and isinstance(variant, str) and (task, variant) not in known
             for task, variant in zip(theirs["task"], theirs["variant"], strict=True)
         ]
-        return cls(root, theirs[lacking], pd.concat(map(pd.read_csv, flown)))
+        return cls(root, theirs[lacking], flown_there)
+
+
+def _flew_alike(first: pd.DataFrame, second: pd.DataFrame, task: str) -> bool:
+    """Whether there are runs on the task in both, and all of them have one return."""
+    both = pd.merge(
+        *(one[(one["task"] == task) & (one["metric"] == "eval_return")] for one in (first, second)),
+        on=["variant", "seed"],
+    )
+    return bool(len(both)) and np.allclose(both["value_x"], both["value_y"])
 
 
 def merged(sizes: pd.DataFrame, flown: pd.DataFrame) -> pd.DataFrame:

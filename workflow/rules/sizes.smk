@@ -3,7 +3,7 @@ from safemr.experiment.catalogue import declared_certificate
 
 SIZED = [
     run
-    for run in PLAN.navigation
+    for run in {run.path: run for run in (*PLAN.navigation, *PLAN.sensitivity)}.values()
     if CONFIG.sizes
     and run in RECORDED
     and run.task in ROBOT_TASKS

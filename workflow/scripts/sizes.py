@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pandas as pd
 
-from safemr import paper
 from safemr.errors import reported_errors
 from safemr.measure.oracle import ORACLE, measured_sizes
 from safemr.measure.store import Measurements
@@ -17,14 +16,15 @@ with reported_errors():
     found = measured_sizes(
         Measurements(params.root), [Path(params.root, folder) for folder in params.folders]
     )
-    others = params.beside and sizes.Others.read(*map(Path, params.beside), ours=found)
+    flown = pd.concat(map(pd.read_csv, snakemake.input.flown))
+    others = params.beside and sizes.Others.read(*map(Path, params.beside), ours=found, flown=flown)
 found.to_csv(output.sizes, index=False)
 sizes.table(found, others).write(Path(output.markdown).parent)
 yardsticks = found[found["certificate"] == ORACLE].set_index("task")["area"].to_dict()
-points = sizes.merged(found, pd.concat(map(pd.read_csv, snakemake.input.flown)))
+points = sizes.merged(found, flown)
 if others:
     points = pd.concat([points, sizes.merged(others.sizes, others.flown)])
-ablation = paper.ABLATION if paper.ABLATION in set(points["variant"]) else params.ablation
-regularizer.table(points, params.tasks, params.method, ablation).write(Path(output.markdown).parent)
+made = regularizer.table(points, params.tasks, params.method, params.ablation)
+made.write(Path(output.markdown).parent)
 figure = against_size(points, params.tasks, yardsticks)
 style.save(figure, Path(output.pdf).with_suffix(""))

@@ -108,7 +108,7 @@ for _base, _tints in (("SafeMR", _WARM), ("JointSIS", _COLD)):
             _ALGORITHMS[_name] = (_tint, _line, _marker, _name)
 # config/forms.yaml: each form at one travel.
 _ALGORITHMS["SafeMR-released"] = (_WARM[2], _DASHED, "<", "SafeMR-released")
-_ALGORITHMS["JointSIS-floored"] = (_COLD[1], _LONG, ">", "JointSIS-floored")
+_ALGORITHMS["JointSIS-floored"] = ("#44AA99", _LONG, "v", "JointSIS-floored")
 # For variants that nobody planned: Tol's "muted" colours, lines and markers, by a checksum of the
 # label, the same in every figure.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")
