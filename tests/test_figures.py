@@ -80,6 +80,14 @@ def test_no_two_algorithms_of_a_configuration_look_alike(path: Path):
             assert other == run.variant, f"{other} and {run.variant} look alike"
 
 
+@pytest.mark.parametrize("name", ["config", "forms"])
+def test_certificates_that_are_drawn_by_size_have_colours_of_their_own(name: str):
+    names = {run.variant for run in planning.resolve(config.load([CONFIGS / "config.yaml"])).runs}
+    chosen = config.load([CONFIGS / "config.yaml", CONFIGS / f"{name}.yaml"])
+    names |= {run.variant for run in planning.resolve(chosen).runs}
+    assert len({style.colour(variant) for variant in names}) == len(names) >= 11
+
+
 def test_the_certificate_check_draws_every_certificate():
     names = [f"SafeMR[{a},0.15] (seed 0)" for a in range(20)] + ["SafeMR (seed 0)"]
     margins = pd.DataFrame({"distance": [1.0, 1.0], "bearing": [0.0, 1.0], "margin": [-1.0, 1.0]})

@@ -109,6 +109,9 @@ for _base, _tints in (("SafeMR", _WARM), ("JointSIS", _COLD)):
 # config/forms.yaml: each form at one travel.
 _ALGORITHMS["SafeMR-released"] = (_WARM[2], _DASHED, "<", "SafeMR-released")
 _ALGORITHMS["JointSIS-floored"] = ("#44AA99", _LONG, "v", "JointSIS-floored")
+# The two other points [a, b] of the paper, beside certificates of all kinds.
+_ALGORITHMS["SafeMR[0.45,0.15]"] = ("#EE3377", _SHORT, "^", "SafeMR[0.45,0.15]")
+_ALGORITHMS["SafeMR[0.35,0.25]"] = ("#994F00", _DASHED, "v", "SafeMR[0.35,0.25]")
 # For variants that nobody planned: Tol's "muted" colours, lines and markers, by a checksum of the
 # label, the same in every figure.
 _OTHERS = ("#882255", "#117733", "#332288", "#999933", "#AA4499", "#88CCEE", "#44AA99", "#CC6677")
