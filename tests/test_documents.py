@@ -351,6 +351,44 @@ def test_the_trials_of_the_forms_and_what_the_rule_chooses() -> None:
     assert (round(other["return"], 1), other["violating_episodes"]) == (11.2, 2)
 
 
+def test_what_decides_on_goal_is_told_as_flown() -> None:
+    tables = ROOT / "results/forms/tables"
+    answers = pd.read_csv(tables / "regularizer.csv").set_index("task")
+    flown = pd.read_csv(tables / "unseen_layouts.csv").set_index(["task", "variant"])
+    pairs = pd.read_csv(tables / "unseen_differences.csv").set_index(["task", "variant", "other"])
+    said, goal = text_of((ROOT / "docs/results.md").read_text()), list(answers.index[:2])
+    assert "On Goal it is the size" in said
+    assert answers.loc[goal, "answer"].tolist() == ["the size"] * 2
+    assert answers.loc[goal[0], "added_high"] < 0  # a little less with [a, b]
+    assert answers.loc[goal[1], "added_low"] < 0 < answers.loc[goal[1], "added_high"]
+    gains, dirty = {}, {}
+    for name in ("JointSIS-floored", "JointSIS-literal"):
+        for task in goal:
+            gap = pairs.loc[task, name, "SafeMR"]
+            assert gap["high"] > 0 < gap["difference"]  # as much as SafeMR, or more
+            text = f"{gap['difference']:.2f} [{gap['low']:.2f}, {gap['high']:.2f}]"
+            gains.setdefault(name, []).append(text)
+            run = flown.loc[task, name]
+            assert run["episodes"] == 500
+            dirty.setdefault(name, []).append(run["violating_episodes"])
+    floored, literal = gains.values()
+    assert f"{floored[0]} more on {goal[0]} and {floored[1]} on {goal[1]}" in said
+    assert f"{literal[0]} and {literal[1]} more" in said
+    of, last = dirty.values()
+    assert f"with {of[0]} and {of[1]} of 500 episodes with a violation (SafeMR: 0 and 2;" in said
+    assert f"more, with {last[0]} and {last[1]} (" in said
+    assert [flown.loc[task, "SafeMR"]["violating_episodes"] for task in goal] == [0, 2]
+    printed = (tables / "unseen_layouts.md").read_text()
+    names = [name for task, name in flown.index if task == goal[0]]
+    labels = {name: [cells(printed, task, name)[1] for task in goal] for name in names}
+    assert {first for first, _ in labels.values()} == {"yes"}
+    open_ones = {name for name, (_, second) in labels.items() if second == "not decided"}
+    assert open_ones == {"JointSIS-floored", "JointSIS-literal", "SafeMR-literal"}
+    sizes = pd.read_csv(tables / "sizes.csv").set_index(["task", "certificate"])
+    feasible = {name for name in names if sizes.loc[(goal[1], name), "feasible"] == 5}
+    assert feasible == open_ones
+
+
 def test_the_two_certificates_beside_the_papers_are_told_as_flown() -> None:
     tables = ROOT / "results/tables"
     page = (ROOT / "docs/oracle.md").read_text()
