@@ -15,6 +15,7 @@ from scipy.special import stdtrit
 from safemr.experiment import planning
 from safemr.learning.networks import LOG_STD_MAX, LOG_STD_MIN
 from safemr.report import statistics
+from safemr.report.sizes import merged
 from safemr.report.statistics import difference_interval
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -375,7 +376,7 @@ def test_what_decides_on_goal_is_told_as_flown() -> None:
     assert f"{floored[0]} more on {goal[0]} and {floored[1]} on {goal[1]}" in said
     assert f"{literal[0]} and {literal[1]} more" in said
     of, last = dirty.values()
-    assert f"with {of[0]} and {of[1]} of 500 episodes with a violation (SafeMR: 0 and 2;" in said
+    assert f"with {of[0]} and {of[1]} of 500 episodes with a violation (SafeMR: 0 and 2)," in said
     assert f"more, with {last[0]} and {last[1]} (" in said
     assert [flown.loc[task, "SafeMR"]["violating_episodes"] for task in goal] == [0, 2]
     printed = (tables / "unseen_layouts.md").read_text()
@@ -387,6 +388,22 @@ def test_what_decides_on_goal_is_told_as_flown() -> None:
     sizes = pd.read_csv(tables / "sizes.csv").set_index(["task", "certificate"])
     feasible = {name for name in names if sizes.loc[(goal[1], name), "feasible"] == 5}
     assert feasible == open_ones
+    first = " and ".join(
+        "{:.2f} [{:.2f}, {:.2f}]".format(*a_point_a_run(task)[:3]) for task in goal
+    )
+    assert f"with each run as a point, gives the same answers: {first}" in said
+
+
+def a_point_a_run(task: str) -> statistics.Estimate:
+    """What the regularizer adds at equal size, by the first version of the rule."""
+    points = []
+    for root in (ROOT / "results/forms/summary", ROOT / "results/summary"):
+        flights = pd.read_csv(root / f"unseen_layouts/{task}.csv")
+        points.append(merged(pd.read_csv(root / "sizes.csv"), flights))
+    runs = pd.concat(points).query("k > 0").drop_duplicates(["variant", "seed"])
+    area = runs["area"].to_numpy()
+    factors = np.column_stack([area, area**2, runs["regularized"].to_numpy(float)])
+    return statistics.linear_effects(factors, runs["return"].to_numpy())[-1]
 
 
 def test_the_two_certificates_beside_the_papers_are_told_as_flown() -> None:
