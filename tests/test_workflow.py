@@ -245,6 +245,21 @@ def test_a_clone_draws_everything_once_and_then_nothing(checkout: Checkout) -> N
     assert checkout.scheduled(targets=made) == {}
 
 
+def test_another_configuration_that_is_not_made_is_told_before_anything_is_trained(
+    checkout: Checkout,
+) -> None:
+    """`sizes.beside`: the rule that reads its files comes last, after hours of training."""
+    protocol = {"unseen_layouts": {"episodes": 4, "seed": 12345}, "results_root": "results/here"}
+    checkout.configure(**protocol, sizes={"beside": "results/there"})
+    file = Path("results/there/summary/unseen_layouts", f"{TASK}.csv")
+    (checkout.folder / file.parent).mkdir(parents=True)
+    (checkout.folder / "results/there/summary/sizes.csv").touch()
+    said = f"warning: sizes.beside: {file} is missing; make the results under results/there first"
+    assert said in checkout.snakemake("-n", "all")
+    (checkout.folder / file).touch()
+    assert "sizes.beside" not in checkout.snakemake("-n", "all")
+
+
 def test_adding_a_baseline_is_one_file_and_one_line(checkout: Checkout) -> None:
     checkout.fill_in_records()
     algorithms = checkout.folder / "safemr/algorithms"

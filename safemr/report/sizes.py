@@ -82,6 +82,18 @@ def table(sizes: pd.DataFrame, others: Others | None = None) -> Table:
 KEPT = ("task", "variant", "seed", "k", "area", "regularized")  # by `merged`
 
 
+def _remedy(root: Path) -> str:
+    return f"make the results under {root} first, or say sizes: true"
+
+
+def missing(sizes: Path, *flights: Path) -> str | None:
+    """What to say if one of the files that `Others.read` takes is missing."""
+    for path in (sizes, *flights):
+        if not path.exists():
+            return f"sizes.beside: {path} is missing; {_remedy(sizes.parent.parent)}"
+    return None
+
+
 @dataclass(frozen=True)
 class Others:
     """Certificates of the runs of another configuration that this one has no variant for.
@@ -109,10 +121,9 @@ class Others:
         returns of the two could then not be compared.
         """
         root = sizes.parent.parent
-        remedy = f"make the results under {root} first, or say sizes: true"
-        for path in (sizes, *flights):
-            if not path.exists():
-                raise UserError(f"sizes.beside: {path} is missing; {remedy}")
+        if said := missing(sizes, *flights):
+            raise UserError(said)
+        remedy = _remedy(root)
         theirs, flown_there = pd.read_csv(sizes), pd.concat(map(pd.read_csv, flights))
         if absent := [name for name in COLUMNS if name not in theirs]:
             raise UserError(f"sizes.beside: {sizes} has no column {absent[0]!r}; {remedy}")

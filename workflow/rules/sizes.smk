@@ -1,4 +1,5 @@
 # How small a certificate may be, and what its size is worth.
+from safemr.errors import tell
 from safemr.experiment.catalogue import declared_certificate
 
 SIZED = [
@@ -11,12 +12,18 @@ SIZED = [
 ]
 SIZED_TASKS = [task for task in CONFIG.tasks if any(run.task == task for run in SIZED)]
 SIZES = f"{SUMMARY}/sizes.csv"
-# The same of another configuration, its sizes first. What is missing of them is for the script to say.
+# The same of another configuration, its sizes first.
 SIZES_BESIDE = [
     CONFIG.sizes_beside / Path(made).relative_to(RESULTS)
     for made in [SIZES, *expand(rules.unseen_layouts.output[0], task=SIZED_TASKS)]
     if CONFIG.sizes_beside
 ]
+# The rule says so too, but after hours of training, and the other configuration may be made by then.
+if SIZES_BESIDE and workflow.is_main_process:
+    from safemr.report.sizes import missing
+
+    if said := missing(*SIZES_BESIDE):
+        tell(f"warning: {said}")
 
 
 rule sizes:
