@@ -748,3 +748,48 @@ def test_sizes_may_stand_beside_those_of_another_root() -> None:
     for wrong in ({}, {"besides": "results"}, {"beside": ""}, {"beside": "config"}, "yes"):
         with pytest.raises(UserError, match="sizes"):
             config.parse(VALID | {"sizes": wrong})
+
+
+def with_own_seeds(**changes: Any) -> dict[str, Any]:
+    """`VALID`, SafeMR with seeds of its own."""
+    algorithms = VALID["algorithms"] | {"SafeMR": {"algorithm": "safemr", "seeds": [100, 102]}}
+    return VALID | {"algorithms": algorithms, "sensitivity": None, **changes}
+
+
+def test_filters_take_the_seeds_of_what_they_name() -> None:
+    filters = {"policies": ["SafeMR"], "certificates": ["phi_h"], "episodes": 3}
+    read = config.parse(with_own_seeds(filters=filters)).filters
+    assert read is not None
+    assert read.seeds == (100, 102)
+    some = config.parse(with_own_seeds(filters=filters | {"seeds": [102]})).filters
+    assert some is not None
+    assert some.seeds == (102,)
+    with pytest.raises(UserError, match=r"unknown seed 101 in filters\.seeds"):
+        config.parse(with_own_seeds(filters=filters | {"seeds": [101]}))
+    both = config.parse(with_own_seeds(filters=filters | {"policies": ["SafeMR", "PPO-L"]})).filters
+    assert both is not None
+    assert both.seeds == (100, 101, 102)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"unseen_layouts": {"episodes": 3, "seed": 9998}}, "unseen_layouts would fly"),
+        ({"unseen_layouts": {"episodes": 100, "seed": 0, "own": True}}, "own: seed 100 would"),
+        ({"unseen_layouts": {"episodes": 98, "seed": 0, "own": True}}, "own: seed 102 would"),
+        ({"filters": VALID["filters"] | {"seed": 10_001}}, "filters would fly"),
+    ],
+)
+def test_unseen_layouts_are_not_those_of_evaluations(changes: dict[str, Any], said: str) -> None:
+    """Evaluations are on layouts 10,000 and 10,001; seeds are 100 to 102."""
+    with pytest.raises(UserError, match=said):
+        config.parse(with_own_seeds(**changes))
+    config.parse(with_own_seeds(unseen_layouts={"episodes": 3, "seed": 10_002}))
+    config.parse(with_own_seeds(unseen_layouts={"episodes": 3, "seed": 9_997}))
+
+
+def test_layouts_of_seeds_of_an_entry_must_be_there_too() -> None:
+    algorithms = VALID["algorithms"] | {"SafeMR": {"algorithm": "safemr", "seeds": [30_000_000]}}
+    own = {"unseen_layouts": {"episodes": 100, "own": True}, "sensitivity": None, "filters": None}
+    with pytest.raises(UserError, match="seed 30000000 would fly layouts up to"):
+        config.parse(VALID | own | {"algorithms": algorithms})

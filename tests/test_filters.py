@@ -320,3 +320,17 @@ def test_a_scripted_controller_flies_behind_a_certificate_and_is_kept(tmp_path: 
     assert len(files) == 2
     filters.measured_unlearned(kept, "scripted", TASK, PHI_H, **LAYOUTS)
     assert [path.stat().st_mtime_ns for path in files] == changed
+
+
+def test_a_flight_without_a_learned_part_is_counted_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Layouts are the same for all seeds: what does not depend on a run is one flight."""
+    metrics = dict.fromkeys(("return", "cost_indicator", "intervened", "distance"), 1.0)
+    monkeypatch.setattr(filters, "measured_unlearned", lambda *_, **__: {"scripted": dict(metrics)})
+    flown = filters.measured_scores(
+        Measurements(tmp_path), [], {"phi_h": []}, episodes=100, seed=20_000,
+        unlearned=["scripted"], task=TASK, seeds=[3, 4, 5],
+    )  # fmt: skip
+    rows = flown[flown["metric"] == "return"]
+    assert rows[["filter", "seed"]].to_numpy().tolist() == [["", 3], ["phi_h", 3]]

@@ -9,6 +9,7 @@ import ast
 import dataclasses
 import sys
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -384,6 +385,22 @@ def test_workers_that_always_die_end_the_run() -> None:
 
     with pytest.raises(UserError, match=r"lost one after the other.*killed"):
         trainer_of(crew=Doomed(0)).advance(TOTAL)
+
+
+def test_a_crew_that_cannot_be_hired_is_let_go_and_the_reason_told() -> None:
+    class Unhired(Crew):
+        closed = False
+
+        def hire(self, worker: Any, *args: Any) -> int:
+            raise TypeError("cannot pickle it")
+
+        def close(self) -> None:
+            self.closed = True
+
+    crew = Unhired(0)
+    with pytest.raises(TypeError, match="cannot pickle it"), closing(trainer_of(crew=crew)) as one:
+        one.advance(TOTAL)
+    assert crew.closed
 
 
 def test_a_checkpoint_is_drained_and_continues(tmp_path: Path) -> None:

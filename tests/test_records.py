@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sample_record import CONFIG, POLICY, make_record
+from sample_record import CONFIG, POLICY, ROWS, make_record
 
 from safemr import files
 from safemr.errors import UserError
@@ -171,6 +171,42 @@ def test_a_damaged_record_is_refused_with_path_and_repair(
         assert str(record) in message
         assert f"rm -r {shlex.quote(str(record))} && snakemake" in message
         assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"steps": "20"}, "steps in config.json is not a whole number of at least 0"),
+        ({"seed": "100"}, "seed in config.json is not a whole number of at least 0"),
+        ({"algorithm": {}}, "algorithm in config.json has no name"),
+        ({"algorithm": "fac"}, "algorithm in config.json has no name"),
+    ],
+)
+def test_a_consistent_record_of_wrong_types_is_refused(
+    changes: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    """Programs outside write records, too: their digests and checksums are as they should be."""
+    config = CONFIG | changes
+    folder = tmp_path / records.record_path(config, "V")
+    folder.mkdir(parents=True)
+    contents = {
+        "config.json": json.dumps(config),
+        "progress.csv": records.format_progress(ROWS),
+    }
+    sums = {name: records.hashlib.sha256(text.encode()).hexdigest()
+            for name, text in contents.items()}  # fmt: skip
+    digest = records.config_digest(config)
+    provenance = {
+        "schema": 1,
+        "digest": digest,
+        "variant": "V",
+        "status": "complete",
+        "files": sums,
+    }
+    for name, text in (contents | {"provenance.json": json.dumps(provenance)}).items():
+        (folder / name).write_text(text)
+    with pytest.raises(RecordError, match=said):
+        records.read_records(tmp_path)
 
 
 def foreign_folders(root: Path, record: Path) -> dict[str, Path]:

@@ -91,3 +91,9 @@ def test_single_runs_are_shown_without_intervals() -> None:
     few = few[few["variant"].isin(["SafeMR", "JointSIS"])]
     row = regularizer.table(few, ["T"], "SafeMR", "JointSIS").display.iloc[0]
     assert row.tolist()[3:] == ["3.39", "–", "–"]  # 9 x 0.3 + 1.3^2 - 1
+
+
+def test_nothing_is_answered_while_runs_are_missing() -> None:
+    points = pd.concat([runs(0.0, noise=0.2), runs(0.0, noise=0.2).assign(task="U")])
+    made = regularizer.table(points, ["T", "U"], "SafeMR", "JointSIS", incomplete={"U"})
+    assert made.data["answer"].tolist() == ["the size", "missing"]

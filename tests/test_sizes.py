@@ -95,15 +95,33 @@ def test_certificates_of_another_configuration_stand_beside_these(
 ) -> None:
     ours = certificates()
     others = sizes.Others.read(*beside(tmp_path / "summary"), ours=ours, flown=flown)
-    assert others.variants == ["C"]  # A is ours, and not mixed with theirs
+    assert others.told == "A (seeds 7), C (seeds 0, 1)"  # one run of A is in both: it is ours
     made = sizes.table(ours, others)
     assert made.data.set_index("certificate")["runs"].to_dict() == {
-        "oracle": 0, "phi_h": 0, "A": 3, "B": 1, "C": 2
+        "oracle": 0, "phi_h": 0, "A": 4, "B": 1, "C": 2
     }  # fmt: skip
-    assert made.caption.endswith(f"Of another configuration's runs (under {tmp_path}): C.")
+    assert made.caption.endswith(
+        f"Of another configuration's runs (under {tmp_path}): {others.told}."
+    )
     points = sizes.merged(others.sizes, others.flown)
     shown = points[["variant", "seed", "return"]].to_numpy().tolist()
-    assert shown == [["C", 0, 10.0], ["C", 1, 10.0]]
+    assert shown == [["A", 7, 10.0], ["C", 0, 10.0], ["C", 1, 10.0]]
+
+
+def test_a_variant_of_both_must_have_flown_alike(tmp_path: Path, flown: pd.DataFrame) -> None:
+    """Its runs are then of one algorithm; else only the label is the same."""
+    files = beside(tmp_path / "summary")
+    both = certificates().assign(variant=lambda rows: rows["variant"].replace("B", "C"))
+    both.loc[both["variant"] == "C", "seed"] = 9
+    with pytest.raises(UserError, match=r"C has runs on .* none with the same seed"):
+        sizes.Others.read(*files, ours=both, flown=flown)
+
+
+def test_seeds_are_told_only_where_they_differ(tmp_path: Path, flown: pd.DataFrame) -> None:
+    files = beside(tmp_path / "summary")
+    kept = pd.read_csv(files[0]).query("seed != 7 and seed != 1")
+    kept.to_csv(files[0], index=False)
+    assert sizes.Others.read(*files, ours=certificates(), flown=flown).told == "C"
 
 
 @pytest.mark.parametrize(
@@ -159,6 +177,7 @@ def test_the_filters_figure_shows_every_flight() -> None:
         (["--sigma", "0.1"], "belong together"),
         (["--set", "task.d_min=1"], "only decisions have settings here"),
         (["--set", "interface.action_repeat=0"], "action_repeat must be"),
+        (["--set", "interface.action_scale=[0.05]"], "action_scale"),  # of two components
         (["--task", "Pillars-0.2-Goal"], "did you mean"),
     ],
 )

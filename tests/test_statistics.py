@@ -310,3 +310,10 @@ def test_linear_effects_need_factors_that_vary_and_runs(factors):
     found = statistics.linear_effects(factors, np.zeros(len(factors)))
     assert len(found) == factors.shape[1]
     assert all(np.isnan(effect.mean) for effect in found)
+
+
+@pytest.mark.parametrize("values", [(0.7, 0.1), (0.75, 0.25)])  # exact in binary, and not
+def test_equal_runs_differ_by_no_more_than_rounding_says(values: tuple[float, float]) -> None:
+    first, second = ([value] * count for value, count in zip(values, (6, 3), strict=True))
+    gap = statistics.difference_interval(np.array(first), np.array(second))
+    assert gap.low == gap.mean == gap.high

@@ -10,6 +10,7 @@ from scipy import stats
 
 from safemr import paper
 from safemr.report import (
+    absence,
     compute,
     differences,
     parallel,
@@ -175,6 +176,18 @@ def test_missing_runs_get_a_row_and_a_note_instead_of_a_gap(scores):
     assert "SafeMR on Pillars-0.15-Goal (seed 3)" in table.notes[0]
     assert "PPO-L on Hazards-0.15-Push (seed 0)" in table.notes[0]
     assert "Runs missing" in table.latex()
+
+
+def test_runs_that_were_recorded_and_not_flown_are_named(scores):
+    """A record's policy is optional; without it, a table of flights lacks the run."""
+    expected = expected_runs(4)
+    flown = scores[scores["seed"] != 1]
+    (note,) = absence.unflown_notes(expected, scores, flown)
+    assert "SafeMR on Pillars-0.15-Goal (seed 1)" in note
+    assert "seed 3" not in note  # which is not recorded: that is another note's business
+    assert absence.unflown_notes(expected, scores, scores) == ()
+    table = tables.full_results(flown, missing=None).noted(note)
+    assert table.markdown().endswith(f"{note}\n")
 
 
 def test_no_run_at_all_still_makes_every_table(scores):

@@ -77,6 +77,16 @@ def test_the_forms_of_tasks_say_the_same() -> None:
         ({"tasks": {"X": {}}}, "unknown task 'X'"),
         ({"tasks": {"X": EIGHT, "x": EIGHT}}, "tasks names 'x' twice"),
         ({"tasks": {"X": EIGHT, "Y": EIGHT}}, "'X' and 'Y' are the same task"),
+        (
+            {"algorithms": {name: {"algorithm": "joint_sis", "seeds": [seed]}
+                            for name, seed in (("A", 0), ("B", 1))}},
+            "'A' and 'B' are the same algorithm",
+        ),
+        (
+            {"sensitivity": {"task": GOAL, "algorithm": "SafeMR",
+                             "points": [[0.45, 0.15], [0.4500001, 0.15]]}},
+            "have the same label, SafeMR[0.45,0.15]",
+        ),
         ({"tasks": [[GOAL]]}, "each of tasks must consist of letters"),
         ({"tasks": {}}, "tasks must be a list, not {}"),
         ({"tasks": [GOAL, {}]}, "each of tasks must consist of letters"),

@@ -140,3 +140,10 @@ def test_the_table_counts_episodes_with_violations() -> None:
     assert math.isnan(ours["behind"])
     interval = statistics.mean_interval(np.array([10.0, 11.0, 12.0]))
     assert (ours["return_low"], ours["return_high"]) == interval[1:3]
+
+
+def test_a_change_is_that_of_the_runs_that_were_flown() -> None:
+    flown = score_table(SafeMR=[10.0, 11.0, 12.0, 13.0])
+    before = score_table(SafeMR=[9.0, 9.0, 9.0, 99.0])
+    data = table(flown[flown["seed"] < 3], before, episodes=20).data
+    assert data["change"].tolist() == pytest.approx([2.0])

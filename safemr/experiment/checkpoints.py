@@ -177,6 +177,9 @@ class RunSession(contextlib.AbstractContextManager["RunSession"]):
                 opened.enter_context(self._signals)
             self._lock.acquire(wait=self._wait, while_waiting=self._stop_waiting)
             opened.callback(self._lock.release)
+            # What was waited for was another process's time, which its checkpoints count.
+            self._started = time.monotonic()
+            self._due = self._started + self._minimum_interval
             self._remove_temporary_files()
             self.complete = records.is_complete(self.folder)
             if self.complete:

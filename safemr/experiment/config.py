@@ -16,19 +16,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safemr.conventions import (
-    CLEAN_SHARE,
-    COST_TOLERANCE,
-    evaluation_seed,
-    own_layouts,
-    unseen_seed,
-)
+from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE
 from safemr.errors import UserError, show
 from safemr.experiment.filter_entries import Filters, read_filters
+from safemr.experiment.layout_entries import Evaluation, UnseenLayouts, check_layouts
 from safemr.experiment.roles import ROLES
 from safemr.experiment.roots import root
 from safemr.experiment.sections import (
-    LARGEST_SEED,
     Section,
     checked_name,
     distinct,
@@ -116,24 +110,6 @@ class Aircraft:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """The deterministic evaluation: how often in a run, how many episodes, which first seed."""
-
-    points: int
-    episodes: int
-    seed: int
-
-
-@dataclass(frozen=True)
-class UnseenLayouts:
-    """Final policies on layouts that no run was evaluated on: how many, and the first seed."""
-
-    episodes: int
-    seed: int
-    own: bool  # each seed's runs on layouts of their own, not all on the same
-
-
-@dataclass(frozen=True)
 class Config:
     """A validated configuration; see config/config.yaml for the meaning of each key."""
 
@@ -182,10 +158,10 @@ def load(files: Sequence[Path | str], overrides: Mapping[str, Any] | None = None
 def parse(raw: Any) -> Config:
     """Check structure, types and ranges of a configuration and return it."""
     top = Section(raw, "the config", _TOP_LEVEL)
-    evaluation = Section(top.required("evaluation"), "evaluation", ("points", "episodes", "seed"))
     wandb = Section(top.get("wandb", {}), "wandb", ("mode", "project"))
     safe = Section(top.get("safe", {}), "safe", ("cost_tolerance", "zero_violation_share"))
     tasks = _tasks(top.required("tasks"), "tasks")
+    algorithms = _variants(top.required("algorithms"), "algorithms")
     seeds = seeds_in(top.required("seeds"), "seeds")
     least = min(seeds)  # decides whose layouts those are that are not named
     sizes, beside = _sizes(top.get("sizes", False))
@@ -201,19 +177,13 @@ def parse(raw: Any) -> Config:
     config = Config(
         tasks=tuple(tasks),
         task_variants={name: variant for name, variant in tasks.items() if variant},
-        algorithms=_variants(top.required("algorithms"), "algorithms"),
+        algorithms=algorithms,
         seeds=seeds,
         budget=_budget(top.required("budget"), "budget"),
         log_points=integer(top.get("log_points", 50), "log_points", 1),
-        evaluation=Evaluation(
-            integer(evaluation.required("points"), "evaluation.points", 1),
-            integer(evaluation.required("episodes"), "evaluation.episodes", 1),
-            integer(
-                evaluation.get("seed", evaluation_seed(least)), "evaluation.seed", 0, LARGEST_SEED
-            ),
-        ),
+        evaluation=Evaluation.read(top.required("evaluation"), least),
         interface=Interface.read(top.get("interface")),
-        unseen_layouts=_unseen(top.get("unseen_layouts"), least),
+        unseen_layouts=UnseenLayouts.read(top.get("unseen_layouts"), least),
         protocol=integer(top.get("protocol", 1), "protocol", 1, 2),
         task_overrides={
             name: _task_overrides(value, f"task_overrides.{name}")
@@ -236,7 +206,12 @@ def parse(raw: Any) -> Config:
         zero_violation_share=number(
             safe.get("zero_violation_share", CLEAN_SHARE), "safe.zero_violation_share", 0, 1
         ),
-        filters=read_filters(top.get("filters"), top.required("algorithms"), tasks, seeds),
+        filters=read_filters(
+            top.get("filters"),
+            {label: variant.seeds for label, variant in algorithms.items()},
+            tasks,
+            seeds,
+        ),
         sizes=sizes,
         sizes_beside=beside,
     )
@@ -244,14 +219,10 @@ def parse(raw: Any) -> Config:
         raise UserError(
             "protocol: 2 judges flights on unseen layouts: say unseen_layouts, too, or protocol: 1"
         )
-    flights = config.unseen_layouts
-    if flights and flights.own:
-        last = own_layouts(flights.seed, flights.episodes, max(seeds) + 1)
-        if last > LARGEST_SEED:
-            raise UserError(
-                f"unseen_layouts.own: seed {max(seeds)} would fly layouts up to {last}, of at most "
-                f"{LARGEST_SEED}; choose smaller seeds"
-            )
+    entries = [variant.seeds for variant in config.algorithms.values()]
+    studied = config.sensitivity.seeds if config.sensitivity else None
+    flown = {seed for own in (*entries, studied) for seed in own or seeds}
+    check_layouts(config.evaluation, config.unseen_layouts, config.filters, flown)
     if config.sizes and not config.unseen_layouts:
         raise UserError(
             "sizes: true draws returns on unseen layouts: say unseen_layouts, too, or sizes: false"
@@ -365,17 +336,6 @@ def _task_overrides(value: Any, where: str) -> TaskOverrides:
         Interface.read(section.value["interface"], f"{where}.interface")
         if "interface" in section.value
         else None,
-    )
-
-
-def _unseen(value: Any, least: int) -> UnseenLayouts | None:
-    if not value and (value is None or isinstance(value, Mapping)):
-        return None
-    section = Section(value, "unseen_layouts", ("episodes", "seed", "own"))
-    return UnseenLayouts(
-        integer(section.required("episodes"), "unseen_layouts.episodes", 1),
-        integer(section.get("seed", unseen_seed(least)), "unseen_layouts.seed", 0, LARGEST_SEED),
-        flag(section.get("own", False), "unseen_layouts.own"),
     )
 
 

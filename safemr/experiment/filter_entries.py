@@ -8,7 +8,7 @@ filters:
   episodes: 100
   seed: 20000 # of the first layout
   tasks: [Pillars-0.15-Goal] # by default all whose robot has a model
-  seeds: [0] # by default all
+  seeds: [0] # by default all that these policies and certificates have
 """
 
 from __future__ import annotations
@@ -41,9 +41,14 @@ class Filters:
 
 
 def read_filters(
-    value: Any, algorithms: Collection[str], tasks: Collection[str], seeds: Sequence[int]
+    value: Any,
+    algorithms: Mapping[str, Sequence[int] | None],
+    tasks: Collection[str],
+    seeds: Sequence[int],
 ) -> Filters | None:
-    """The entry, for a configuration with these algorithms, tasks and seeds; None without it.
+    """The entry, for a configuration with these tasks and algorithms; None without it.
+
+    algorithms: label -> seeds, None where they are ``seeds``, those of the configuration.
 
     Raises UserError for the first fault.
     """
@@ -60,13 +65,17 @@ def read_filters(
         distinct(found, f"filters.{key}")
         return tuple(found)
 
-    asked = seeds_in(section.get("seeds", list(seeds)), "filters.seeds")
+    policies = names("policies", "policy", {*UNLEARNED, *algorithms})
+    certificates = names("certificates", "certificate", {*HANDCRAFTED, *algorithms})
+    named = [algorithms[name] for name in (*policies, *certificates) if name in algorithms]
+    flown = sorted({seed for own in named or [None] for seed in (own or seeds)})
+    asked = seeds_in(section.get("seeds", flown), "filters.seeds")
     for seed in asked:
-        if seed not in seeds:
-            raise unknown("seed", seed, map(str, seeds), "filters.seeds")
+        if seed not in flown:
+            raise unknown("seed", seed, map(str, flown), "filters.seeds")
     return Filters(
-        names("policies", "policy", {*UNLEARNED, *algorithms}),
-        names("certificates", "certificate", {*HANDCRAFTED, *algorithms}),
+        policies,
+        certificates,
         integer(section.required("episodes"), "filters.episodes", 1),
         integer(section.get("seed", unseen_seed(min(seeds))), "filters.seed", 0, LARGEST_SEED),
         names("tasks", "task", tasks) if "tasks" in section.value else None,

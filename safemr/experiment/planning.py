@@ -313,6 +313,11 @@ class _Resolver:
             overrides = {**base.overrides, "a": a, "b": b}
             same = hyperparameters(algorithm, overrides, where) == own
             label = part.variant if same else f"{part.variant}[{a:g},{b:g}]"
+            if label in points:
+                raise UserError(
+                    f"sensitivity.points: {list(points[label])} and {[a, b]} have the same label, "
+                    f"{label}; remove one"
+                )
             variants[label], points[label] = Variant(base.algorithm, overrides), (a, b)
         return variants, points
 
@@ -393,7 +398,8 @@ def _check_distinct(plan: Plan) -> None:
     """Two labels for one thing would be trained twice and shown as two findings."""
     labels: dict[tuple[str, str], str] = {}
     for run in plan.runs:
-        key = (run.task, run.digest)
+        without_seed = {name: value for name, value in run.config.items() if name != "seed"}
+        key = (run.task, records.config_digest(without_seed))
         if labels.setdefault(key, run.variant) != run.variant:
             raise UserError(
                 f"{labels[key]!r} and {run.variant!r} are the same algorithm with the same "

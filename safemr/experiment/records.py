@@ -216,6 +216,13 @@ def verified(folder: Path) -> tuple[dict[str, Any], dict[str, Any], list[dict[st
             raise refuse(f"{name} in its provenance is not a number of at least 0")
     if not isinstance(provenance.get("cpu"), (str, type(None))):
         raise refuse("cpu in its provenance is not text")
+    for name in ("seed", "steps"):
+        if type(config[name]) is not int or config[name] < 0:
+            raise refuse(f"{name} in config.json is not a whole number of at least 0")
+    if not isinstance(config["algorithm"], dict) or not isinstance(
+        config["algorithm"].get("name"), str
+    ):
+        raise refuse("algorithm in config.json has no name")
     try:
         place = record_path(config, provenance["variant"]).parts
     except (KeyError, TypeError, ValueError) as error:

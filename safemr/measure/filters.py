@@ -184,7 +184,8 @@ def measured_scores(
 ) -> pd.DataFrame:
     """Score table of the records ``policies``, each without a filter and behind each certificate.
 
-    Then of ``unlearned`` policies (`UNLEARNED`) in ``task``, behind the certificates of ``seeds``.
+    Then of ``unlearned`` policies (`UNLEARNED`) in ``task``, behind the certificates of ``seeds``;
+    where no run's certificate is in it a flight is the same for all seeds, and a row of the first.
 
     certificates: name -> records of the runs that learned it, of which the one with the policy's
     seed is taken; none for a handcrafted one (`HANDCRAFTED`). A record without a policy gives no
@@ -219,6 +220,8 @@ def measured_scores(
     for kind in unlearned:
         for run in seeds:
             for name, certificate in behind(run):
+                if run != seeds[0] and (name == UNFILTERED or name in HANDCRAFTED):
+                    continue
                 flown = measured_unlearned(
                     measurements, kind, task, certificate, episodes=episodes, seed=seed
                 )

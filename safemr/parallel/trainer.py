@@ -157,6 +157,7 @@ class Trainer:
         self._make_crew = crew
         self._crew: Crew | None = None
         self._closed = False
+        self._workers: list[list[Any]] = []
         self._of_crew: dict[str, Any] = {}  # what its `notes` said
         self._resumed: Mapping[str, Any] | None = None
 
@@ -175,7 +176,7 @@ class Trainer:
         config, resumed = self.config, self._resumed
         crew = self._crew = self._make_crew(config.samplers + config.buffers + config.learners)
         self._of_crew = crew.notes()
-        self._workers: list[list[Any]] = [
+        self._workers = [
             [self._hired(kind, index) for index in range(len(lives))]
             for kind, lives in enumerate(self._lives)
         ]
@@ -229,10 +230,12 @@ class Trainer:
         self._closed = True
         if self._crew is None:
             return
-        for each in (worker for kind in self._workers for worker in kind):
-            self._crew.dismiss(each)
-        self._crew.close()
-        self._crew = None
+        try:
+            for each in (worker for kind in self._workers for worker in kind):
+                self._crew.dismiss(each)
+        finally:
+            self._crew.close()
+            self._crew = None
 
     # Training
 

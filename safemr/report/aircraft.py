@@ -11,7 +11,8 @@ from safemr import paper
 from safemr.aircraft.scoring import CONTROL, FLIGHTS, as_scores
 from safemr.conventions import COVERS
 from safemr.report import statistics
-from safemr.report.tables import ABSENT, FEW, Table, describe_missing, plus_minus
+from safemr.report.absence import describe_missing
+from safemr.report.tables import ABSENT, FEW, Table, plus_minus
 from safemr.tasks import Task, name_of
 
 

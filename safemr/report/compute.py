@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from safemr.report.tables import ABSENT, Table, entries, missing_notes
+from safemr.report.absence import missing_notes
+from safemr.report.tables import ABSENT, Table, entries
 
 
 def table(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pandas as pd
 
 from safemr.report import statistics
-from safemr.report.tables import FEW, Table, entries, missing_notes, plus_minus
+from safemr.report.absence import missing_notes
+from safemr.report.tables import FEW, Table, entries, plus_minus
 
 
 def differences(

@@ -11,8 +11,9 @@ import pandas as pd
 
 from safemr import paper
 from safemr.report import statistics
+from safemr.report.absence import describe_missing
 from safemr.report.statistics import Estimate
-from safemr.report.tables import SafetyRule, describe_missing
+from safemr.report.tables import SafetyRule
 
 Verdict = Literal["confirmed", "refuted", "inconclusive", "not testable", "not run"]
 

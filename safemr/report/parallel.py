@@ -5,8 +5,9 @@ from __future__ import annotations
 import pandas as pd
 
 from safemr.report import statistics
+from safemr.report.absence import missing_notes
 from safemr.report.statistics import Estimate
-from safemr.report.tables import ABSENT, FEW, Table, entries, missing_notes, plus_minus
+from safemr.report.tables import ABSENT, FEW, Table, entries, plus_minus
 
 AGES = ("gradient_age", "policy_age")
 

@@ -6,7 +6,7 @@ the loss: the rule stands in docs/claims.md, "The second protocol".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from safemr import paper
 from safemr.report import statistics
 from safemr.report.second_protocol import PRIMARY_LEVEL
 from safemr.report.statistics import Estimate
-from safemr.report.tables import ABSENT, FEW, Table
+from safemr.report.tables import ABSENT, FEW, MISSING, Table
 
 SHARE = 0.5  # of the difference to be explained: what the size may leave over
 FEWEST = 8  # certificates, four more than there are coefficients
@@ -62,10 +62,18 @@ def answer(gap: Estimate, added: Estimate) -> str:
     return "less than the size promises" if added.high < 0 else "not decided"
 
 
-def table(points: pd.DataFrame, tasks: Sequence[str], method: str, ablation: str) -> Table:
+def table(
+    points: pd.DataFrame,
+    tasks: Sequence[str],
+    method: str,
+    ablation: str,
+    *,
+    incomplete: Collection[str] = (),
+) -> Table:
     """A row a task.
 
-    points: `safemr.report.sizes.merged`; method, ablation: as `pair` takes them.
+    points: `safemr.report.sizes.merged`; method, ablation: as `pair` takes them; incomplete: tasks
+    on which runs are missing, of which nothing is answered.
     """
     method, ablation = pair(points, method, ablation)
     rows: list[dict[str, Any]] = []
@@ -83,7 +91,7 @@ def table(points: pd.DataFrame, tasks: Sequence[str], method: str, ablation: str
                 "certificates": runs["variant"].nunique(),
                 "difference": gap.mean, "difference_low": gap.low, "difference_high": gap.high,
                 "added": added.mean, "added_low": added.low, "added_high": added.high,
-                "answer": answer(gap, added),
+                "answer": MISSING if task in incomplete else answer(gap, added),
             }
         )  # fmt: skip
 

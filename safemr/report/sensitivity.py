@@ -9,7 +9,8 @@ import pandas as pd
 
 from safemr import paper
 from safemr.report import statistics
-from safemr.report.tables import MISSING, SafetyRule, Table, missing_notes, number, plus_minus
+from safemr.report.absence import missing_notes
+from safemr.report.tables import MISSING, SafetyRule, Table, number, plus_minus
 
 
 def table_two(

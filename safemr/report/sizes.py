@@ -15,7 +15,8 @@ import pandas as pd
 from safemr.certificates.certificate import EnergyCertificate
 from safemr.certificates.families import PAPER
 from safemr.errors import UserError
-from safemr.experiment.planning import describe_task
+from safemr.experiment.planning import describe_task, fitted_interface
+from safemr.experiment.sections import told
 from safemr.experiment.strict_yaml import assignment
 from safemr.learning.interface import Interface
 from safemr.measure.certify import DEFAULT_TASK
@@ -73,9 +74,8 @@ def table(sizes: pd.DataFrame, others: Others | None = None) -> Table:
         "the share and the least g are of the worst run. The oracle is the feasible member of the "
         "paper's family with the least area, in the box in which the learners keep zeta by default."
     )
-    if others and others.variants:
-        caption += f" Of another configuration's runs (under {others.root}): "
-        caption += ", ".join(others.variants) + "."
+    if others and len(others.sizes):
+        caption += f" Of another configuration's runs (under {others.root}): {others.told}."
     return Table("sizes", caption, data, display, [FEW])
 
 
@@ -96,7 +96,7 @@ def missing(sizes: Path, *flights: Path) -> str | None:
 
 @dataclass(frozen=True)
 class Others:
-    """Certificates of the runs of another configuration that this one has no variant for.
+    """Certificates of the runs of another configuration that this one does not have.
 
     root: its results root; sizes: its rows for them, of `safemr.measure.oracle.COLUMNS`; flown:
     the flights of all its runs on these tasks, by task, variant, seed, metric and value.
@@ -107,8 +107,15 @@ class Others:
     flown: pd.DataFrame
 
     @property
-    def variants(self) -> list[str]:
-        return list(self.sizes["variant"].unique())
+    def told(self) -> str:
+        """For a caption: the variants and, where seeds differ from variant to variant, these."""
+        seeds = {
+            name: told(part["seed"].astype(int).unique())
+            for name, part in self.sizes.groupby("variant", sort=False)
+        }
+        if len(set(seeds.values())) < 2:
+            return ", ".join(seeds)
+        return ", ".join(f"{name} (seeds {which})" for name, which in seeds.items())
 
     @classmethod
     def read(cls, sizes: Path, *flights: Path, ours: pd.DataFrame, flown: pd.DataFrame) -> Others:
@@ -117,8 +124,8 @@ class Others:
         sizes, flights: files that the pipeline made under the summary of the other's results root;
         ours: this configuration's sizes, as `table` takes them; flown: its flights.
         Raises UserError where a file is missing or old, where sizes were measured for other
-        decisions, or where a task has no run in both that flew alike: areas, feasibility and
-        returns of the two could then not be compared.
+        decisions, or where a task, or a variant that both have, has no run in both that flew alike:
+        areas, feasibility and returns of the two could then not be compared.
         """
         root = sizes.parent.parent
         if said := missing(sizes, *flights):
@@ -147,12 +154,20 @@ class Others:
                     "that flights may be on other layouts: have a run of it here, too, with the "
                     "same unseen_layouts, or say sizes: true"
                 )
-        known = set(zip(ours["task"], ours["variant"], strict=True))
-        lacking = [
-            task in tasks and isinstance(variant, str) and (task, variant) not in known
-            for task, variant in zip(theirs["task"], theirs["variant"], strict=True)
-        ]
-        return cls(root, theirs[lacking], flown_there)
+        keys = ["task", "variant", "seed"]
+        theirs = theirs[theirs["task"].isin(tasks)].dropna(subset="variant")
+        here, there = (
+            one.dropna(subset="variant").astype({"seed": int}).set_index(keys).index
+            for one in (ours, theirs)
+        )
+        both = set(here.droplevel("seed")) & set(there.droplevel("seed"))
+        if apart := sorted(both - set(here.intersection(there).droplevel("seed"))):
+            task, variant = apart[0]
+            raise UserError(
+                f"sizes.beside: {variant} has runs on {task} here and under {root}, but none with "
+                "the same seed, so that they may differ in more: rename it, or have such a run"
+            )
+        return cls(root, theirs[~there.isin(here)], flown_there)
 
 
 def _flew_alike(first: pd.DataFrame, second: pd.DataFrame, task: str) -> bool:
@@ -208,7 +223,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if None in zeta and any(value is not None for value in zeta):
         raise UserError("--sigma, --k and --n belong together: give all three")
     task = describe_task(options.task, {}, "--task")
-    yardstick = Yardstick(task, Interface.read(entry or None))
+    interface = fitted_interface(Interface.read(entry or None), task, "--set interface")
+    yardstick = Yardstick(task, interface)
     with tempfile.TemporaryDirectory() as folder:
         measurements = Measurements(folder)
         rows = yardstick.references(measurements)

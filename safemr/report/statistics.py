@@ -418,6 +418,8 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def _variance_of_mean(sample: np.ndarray) -> float:
+    if sample.min() == sample.max():  # whose deviation is rounding
+        return 0.0
     return float(sample.var(ddof=1) / len(sample))
 
 

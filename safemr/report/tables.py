@@ -8,7 +8,7 @@ listed in its notes, and a row without any run says "missing".
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +18,7 @@ import pandas as pd
 from safemr import paper
 from safemr.conventions import CLEAN_SHARE, COST_TOLERANCE
 from safemr.report import statistics
+from safemr.report.absence import missing_notes
 from safemr.report.statistics import Estimate
 
 FEW = (
@@ -129,6 +130,10 @@ class Table:
     data: pd.DataFrame
     display: pd.DataFrame
     notes: Sequence[str] = field(default_factory=tuple)
+
+    def noted(self, *notes: str) -> Table:
+        """This table with these notes, too."""
+        return replace(self, notes=tuple(dict.fromkeys([*self.notes, *notes])))
 
     def markdown(self) -> str:
         """GitHub Markdown: caption, table, notes."""
@@ -339,28 +344,6 @@ def best_safe_baseline(
         if better and rule.is_safe(scores, task, variant):
             best, returns = variant, values
     return best, returns
-
-
-def describe_missing(missing: pd.DataFrame) -> str:
-    """ "SafeMR on Hazards-0.15-Push (seeds 3, 4); ..." from rows (task, variant, seed)."""
-    groups = missing.groupby(["task", "variant"], sort=False)["seed"]
-    return "; ".join(
-        f"{variant} on {task} (seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))})"
-        for (task, variant), seeds in groups
-    )
-
-
-def missing_notes(
-    missing: pd.DataFrame | None, tasks: Sequence[str] | None, variants: Sequence[str] | None
-) -> tuple[str, ...]:
-    """What a table says of the runs that it lacks, out of `statistics.missing_runs`."""
-    if missing is None:
-        return ()
-    if tasks is not None:
-        missing = missing[missing["task"].isin(list(tasks))]
-    if variants is not None:
-        missing = missing[missing["variant"].isin(list(variants))]
-    return (f"Runs missing: {describe_missing(missing)}.",) if len(missing) else ()
 
 
 def entries(data: pd.DataFrame, missing: pd.DataFrame | None) -> list[tuple[str, str]]:

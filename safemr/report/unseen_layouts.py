@@ -29,13 +29,15 @@ def table(
     violation, as if all episodes of all seeds were independent.
     """
     rule = rule or SafetyRule()
+    keys = ["task", "variant", "seed"]
+    evaluated = scores.merge(flown[keys].drop_duplicates())  # a change is of the same runs
     rows = []
     for task, variant in entries(flown, None):
         ours = {
             metric: statistics.scores_of(flown, task, variant, metric)
             for metric in ("eval_return", rule.cost, rule.clean)
         }
-        before = statistics.scores_of(scores, task, variant, "eval_return")
+        before = statistics.scores_of(evaluated, task, variant, "eval_return")
         mean = statistics.mean_interval(ours["eval_return"])
         best = statistics.scores_of(flown, task, method, "eval_return")
         gap = statistics.difference_interval(best, ours["eval_return"])

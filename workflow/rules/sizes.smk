@@ -2,14 +2,14 @@
 from safemr.errors import tell
 from safemr.experiment.catalogue import declared_certificate
 
-SIZED = [
+TO_SIZE = [
     run
     for run in {run.path: run for run in (*PLAN.navigation, *PLAN.sensitivity)}.values()
     if CONFIG.sizes
-    and run in RECORDED
     and run.task in ROBOT_TASKS
     and declared_certificate(run.config["algorithm"]["name"]) == "energy"
 ]
+SIZED = [run for run in TO_SIZE if run.path in RECORDED_PATHS]
 SIZED_TASKS = [task for task in CONFIG.tasks if any(run.task == task for run in SIZED)]
 SIZES = f"{SUMMARY}/sizes.csv"
 # The same of another configuration, its sizes first.
@@ -56,6 +56,7 @@ rule sizes:
     params:
         root=RESULTS,
         folders=[run.path.as_posix() for run in SIZED],
+        expected=expected(TO_SIZE),
         tasks=SIZED_TASKS,
         method=METHOD,
         ablation=ABLATION,

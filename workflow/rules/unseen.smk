@@ -1,5 +1,6 @@
 # The final policies on layouts that no run was evaluated on: ten fixed layouts say little of others.
 PROTOCOL_TABLES = ["windows", "training_violations", "power", "power_of_safety"]
+TO_FLY = expected((*PLAN.navigation, *PLAN.sensitivity))
 FLOWN = {}
 for run in (*PLAN.navigation, *PLAN.sensitivity):
     if run.path in RECORDED_PATHS:
@@ -34,6 +35,7 @@ rule unseen_table:
     input:
         flown=expand(rules.unseen_layouts.output[0], task=FLOWN),
         scores=rules.aggregate.output.scores,
+        runs=rules.aggregate.output.runs,
     output:
         *[
             report(
@@ -57,6 +59,7 @@ rule unseen_table:
         method=METHOD,
         **SAFE,
         own=CONFIG.unseen_layouts and CONFIG.unseen_layouts.own,
+        expected=TO_FLY,
         sources=sources("unseen_table"),
     script:
         "../scripts/unseen_table.py"
@@ -84,6 +87,7 @@ rule protocol:
     input:
         judged=rules.judged.output[0],
         progress=rules.aggregate.output.progress,
+        runs=rules.aggregate.output.runs,
     output:
         *[
             report(
@@ -102,6 +106,7 @@ rule protocol:
         method=METHOD,
         baselines=PLAN.grid.rivals,
         **SAFE,
+        expected=TO_FLY,
         sources=sources("protocol"),
     script:
         "../scripts/protocol.py"

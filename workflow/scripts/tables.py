@@ -5,6 +5,7 @@ from pathlib import Path
 import pandas as pd
 
 from safemr.report import compute, differences, parallel, second_protocol, statistics, tables
+from safemr.report.absence import unflown_notes
 
 given, params = snakemake.input, snakemake.params
 learned = pd.read_csv(given.scores)
@@ -28,10 +29,13 @@ made = [
         scores, missing=missing, rule=rule, layouts=params.layouts, flown=params.flown
     ),
     differences.differences(learned, missing=missing, source=source),
-    compute.table(runs, workers=bool(given.progress)),
 ]
 if params.push:
     made.append(tables.push_split(scores, params.push, missing=missing, rule=rule))
+if params.flown:
+    notes = unflown_notes(expected, runs, learned)
+    made = [table.noted(*notes) for table in made]
+made.append(compute.table(runs, workers=bool(given.progress)))
 if given.progress:
     progress = pd.read_csv(given.progress)
     made.append(parallel.table(learned, progress, runs, missing=missing))
