@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from safemr.report import regularizer
+from safemr.report.figures.regularizer import at_equal_size
 from safemr.report.statistics import Estimate
 
 AREAS = {
@@ -97,3 +98,28 @@ def test_nothing_is_answered_while_runs_are_missing() -> None:
     points = pd.concat([runs(0.0, noise=0.2), runs(0.0, noise=0.2).assign(task="U")])
     made = regularizer.table(points, ["T", "U"], "SafeMR", "JointSIS", incomplete={"U"})
     assert made.data["answer"].tolist() == ["the size", "missing"]
+
+
+def test_the_curves_are_the_fit() -> None:
+    areas = np.array([0.5, 1.0, 1.4])
+    without, with_ab = regularizer.curves(runs(1.5).query("k > 0"), areas)
+    assert without == pytest.approx(30 - 9 * areas - areas**2, abs=2e-3)  # of means over runs
+    assert with_ab - without == pytest.approx([1.5] * 3)
+
+
+def test_the_figure_shows_a_mark_a_certificate_and_two_curves() -> None:
+    points = pd.concat([runs(1.5, noise=0.1), runs(0.0).assign(task="U").query("area > 0.95")])
+    made = regularizer.table(points, ["T", "U", "V"], "SafeMR", "JointSIS")
+    said = regularizer.in_words(made)
+    assert said[0].startswith("with [a, b] minus without, at equal size: 1.")
+    assert said[1:] == ["", ""]  # too few certificates, and none
+    figure = at_equal_size(points, ["T", "U", "V"], said)
+    enough, few, none = figure.axes
+    assert enough.get_title().endswith(said[0])
+    marks = [sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() in ("o", "s"))
+             for ax in figure.axes]  # fmt: skip
+    assert marks == [8, 5, 0]
+    curves = [sum(len(line.get_xdata()) == 60 for line in ax.lines) for ax in figure.axes]
+    assert curves == [2, 0, 0]
+    assert {text.get_text() for text in few.texts} <= {text.get_text() for text in enough.texts}
+    assert "no record" in none.texts[0].get_text()

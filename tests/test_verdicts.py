@@ -78,8 +78,8 @@ def test_parts_stand_behind_their_verdict() -> None:
         f"**inconclusive**: {paper.TASKS[3]}"
     )
     # A figure is linked where something was run that it shows.
-    assert "parameters.png" in found["Any [a, b] works, and training converges"][1]
-    assert "sensitivity.png" not in found["Any [a, b] works, and training converges"][1]
+    assert "parameters.png" in found["All three [a, b] work, and training does not diverge"][1]
+    assert "sensitivity.png" not in found["All three [a, b] work, and training does not diverge"][1]
 
 
 def test_links_in_a_table_lead_where_they_led(tmp_path: Path) -> None:

@@ -308,7 +308,8 @@ class _Resolver:
         algorithm = load_algorithm(base.algorithm)
         where = f"sensitivity.{part.variant}"
         own = hyperparameters(algorithm, base.overrides, where)
-        variants, points = {}, {}
+        variants: dict[str, Variant] = {}
+        points: dict[str, tuple[float, float]] = {}
         for a, b in part.points:
             overrides = {**base.overrides, "a": a, "b": b}
             same = hyperparameters(algorithm, overrides, where) == own

@@ -409,7 +409,7 @@ def claims_table(evidence: Evidence, protocol: int = 1) -> Table:
         {
             "paper's statement": data["statement"],
             "our measure": data["measure"],
-            "ours [95% interval]": [
+            "ours [95% interval if not said]": [
                 describe(Estimate(mean, low, high, int(count)))
                 for mean, low, high, count in data[COLUMNS].to_numpy(float)
             ],

@@ -75,7 +75,12 @@ QUESTIONS = (
     }),
     Question("Is the certificate small and feasible?", "Certificate", {
         "The check of the certificates": ("certificates",),
-        "How small it may be": ("return_against_size", "regularizer", "sizes"),
+        "How small it may be": (
+            "return_against_size",
+            "return_at_equal_size",
+            "regularizer",
+            "sizes",
+        ),
         "The multiplier and the learned safe set": ("multiplier_maps",),
         "The energy function": ("energy_and_safe_set",),
         "A narrow passage": ("narrow_passage",),

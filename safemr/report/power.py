@@ -100,8 +100,8 @@ def of_returns(
     heads += [f"seen with {seeds} seeds" for seeds in SEEDS]
     heads += [*(f"power with {seeds}" for seeds in SEEDS), f"seeds for {WANTED:.0%}"]
     caption = (
-        f"What five and ten seeds can see of a difference of flown returns to {method}: standard "
-        "deviations between runs; the least true difference at which Welch's "
+        "What five and ten seeds of both can see of a difference of flown returns to "
+        f"{method}: standard deviations between runs; the least true difference at which Welch's "
         f"{100 * PRIMARY_LEVEL:g}% interval, that of the primary claim, excludes 0 in "
         f"{WANTED:.0%} of {DRAWS:,} simulated experiments with the pooled deviation of the two; "
         "and, if the difference seen here is the true one, the share in which it does so and the "

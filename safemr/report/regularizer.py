@@ -31,11 +31,29 @@ def at_equal_size(points: pd.DataFrame) -> Estimate:
     points: runs on one task, with variant, area, regularized (R) and return. nan where certificates
     are too few, or all alike in R.
     """
-    chosen = points[["variant", "area", "regularized", "return"]].astype({"regularized": float})
-    means = chosen.groupby("variant").mean()
-    area = means["area"].to_numpy()
-    factors = np.column_stack([area, area**2, means["regularized"].to_numpy()])
+    means = _means(points)
+    factors = _factors(means["area"].to_numpy(), means["regularized"].to_numpy())
     return statistics.linear_effects(factors, means["return"].to_numpy())[-1]
+
+
+def curves(points: pd.DataFrame, areas: np.ndarray) -> np.ndarray:
+    """[2, n] what the fit of `at_equal_size` says of areas [n] without and with the regularizer."""
+    means = _means(points)
+    found, values = means["area"].to_numpy(), means["return"].to_numpy()
+    design = np.insert(_factors(found, means["regularized"].to_numpy()), 0, 1.0, axis=1)
+    fitted = np.linalg.lstsq(design, values, rcond=None)[0]
+    return np.stack(
+        [fitted[0] + _factors(areas, np.full(len(areas), made)) @ fitted[1:] for made in (0.0, 1.0)]
+    )
+
+
+def _means(points: pd.DataFrame) -> pd.DataFrame:
+    chosen = points[["variant", "area", "regularized", "return"]].astype({"regularized": float})
+    return chosen.groupby("variant").mean()
+
+
+def _factors(area: np.ndarray, regularized: np.ndarray) -> np.ndarray:
+    return np.column_stack([area, area**2, regularized])
 
 
 def pair(points: pd.DataFrame, method: str, ablation: str) -> tuple[str, str]:
@@ -124,3 +142,14 @@ def table(
         f"(docs/claims.md). No answer stands with fewer than {FEWEST} certificates."
     )
     return Table("regularizer", caption, pd.DataFrame(rows), display, [FEW])
+
+
+def in_words(table: Table) -> list[str]:
+    """Of each row what a figure's title says: gamma with its interval, where there is an answer."""
+    return [
+        f"with [a, b] minus without, at equal size: {row.added:.2f} [{row.added_low:.2f}, "
+        f"{row.added_high:.2f}]"
+        if row.certificates >= FEWEST and row.answer != MISSING
+        else ""
+        for row in table.data.itertuples()
+    ]

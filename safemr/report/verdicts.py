@@ -29,7 +29,7 @@ ROWS: Mapping[str, Mapping[str, str]] = {
         "feasibility_paper": "under the paper's certificates",
         "feasibility_ours": "under those learned here",
     },
-    "Any [a, b] works, and training converges": {
+    "All three [a, b] work, and training does not diverge": {
         "sensitivity_return": "return above JointSIS's",
         "sensitivity_cost": "violations vanish",
         "slowest_certificate": "zeta = (sigma, k, n) settles last",

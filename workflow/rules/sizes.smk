@@ -50,6 +50,12 @@ rule sizes:
             caption="../report/sizes.rst",
             category="Figures",
         ),
+        fit_pdf=f"{FIGURES}/return_at_equal_size.pdf",
+        fit_png=report(
+            f"{FIGURES}/return_at_equal_size.png",
+            caption="../report/regularizer.rst",
+            category="Figures",
+        ),
     log:
         f"{LOGS}/sizes.log",
     threads: 1

@@ -10,6 +10,7 @@ from safemr.measure.store import Measurements
 from safemr.report import regularizer, sizes, statistics
 from safemr.report.absence import missing_notes, unflown_notes
 from safemr.report.figures import style
+from safemr.report.figures.regularizer import at_equal_size
 from safemr.report.figures.sizes import against_size
 
 params, output = snakemake.params, snakemake.output
@@ -34,5 +35,7 @@ made = regularizer.table(
     points, params.tasks, params.method, params.ablation, incomplete=set(absent["task"])
 )
 made.noted(*notes).write(Path(output.markdown).parent)
+figure = at_equal_size(points, params.tasks, regularizer.in_words(made))
+style.save(figure, Path(output.fit_pdf).with_suffix(""))
 figure = against_size(points, params.tasks, yardsticks)
 style.save(figure, Path(output.pdf).with_suffix(""))

@@ -146,7 +146,7 @@ def draw_frontier(
     ax.fill_between(100 * frontier["missed_share"], 0, frontier["volume_ratio"], fc="none",
                     ec="0.82", hatch="////", lw=0)  # fmt: skip
     ax.plot(100 * frontier["missed_share"], frontier["volume_ratio"], color="k", lw=1.4)
-    ax.text(6.0, 0.62, r"out of reach of any $[\sigma,k,n]$",
+    ax.text(6.0, 0.62, r"below the least found of all $[\sigma,k,n]$",
             bbox={"fc": "white", "ec": "none", "pad": 1.0})  # fmt: skip
     looks = {"phi_h": (style.colour("FAC-phih"), "X"), "phi_0": (style.colour("FAC-phi0"), "P"),
              "code init": ("k", "1")}  # fmt: skip

@@ -50,18 +50,22 @@ def draw_marks(points: pd.DataFrame, ax: Axes, *, dirty_share: float) -> Axes:
     return ax
 
 
-def name_marks(points: pd.DataFrame, ax: Axes, *, bold: str = "") -> None:
-    """Names beside the marks, where they cover least; the layout of the figure must be done."""
+def name_marks(points: pd.DataFrame, ax: Axes, *, x: str = "dirty", bold: str = "") -> None:
+    """Names beside the marks, where they cover least; the layout of the figure must be done.
+
+    points: variant, return and ``x``, and where there are intervals their _low and _high.
+    """
     figure = ax.get_figure()
     assert figure is not None
     scale = figure.dpi / 72
-    marks = ax.transData.transform(points[["dirty", "return"]].to_numpy(float))
-    covered = [(Bbox.from_extents(x - 4 * scale, y - 4 * scale, x + 4 * scale, y + 4 * scale), 3.0)
-               for x, y in marks]  # fmt: skip
+    marks = ax.transData.transform(points[[x, "return"]].to_numpy(float))
+    reach = 4 * scale
+    covered = [(Bbox.from_extents(*(mark - reach), *(mark + reach)), 3.0) for mark in marks]
     for _, row in points.iterrows():
+        left, right = row.get(f"{x}_low", np.nan), row.get(f"{x}_high", np.nan)
         for low, high in (
-            ((row["dirty"], row["return_low"]), (row["dirty"], row["return_high"])),
-            ((row["dirty_low"], row["return"]), (row["dirty_high"], row["return"])),
+            ((row[x], row["return_low"]), (row[x], row["return_high"])),
+            ((left, row["return"]), (right, row["return"])),
         ):
             if not np.isnan([*low, *high]).any():
                 (x0, y0), (x1, y1) = ax.transData.transform([low, high])
