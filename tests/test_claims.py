@@ -222,9 +222,7 @@ def test_what_is_said_of_curves_must_hold_on_every_task(scores, name):
 
 def test_the_claims_table_says_where_seeds_agree_exactly(scores):
     table = claims.claims_table(evidence(with_baselines(scores)))
-    shown = dict(
-        zip(table.data["claim"], table.display["ours [95% interval if not said]"], strict=True)
-    )
+    shown = dict(zip(table.data["claim"], table.display[claims.OURS], strict=True))
     assert shown["zero_violations"] == "1 in every seed"
     assert re.fullmatch(r"[\d.]+ \[[\d.]+, [\d.]+\]", shown[f"highest_return[{TASK}]"])
 

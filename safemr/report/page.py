@@ -31,6 +31,7 @@ from PIL import Image
 from safemr import files
 from safemr.errors import UserError
 from safemr.report import printed
+from safemr.report.claims import OURS
 from safemr.report.grounds import Pair, grounds
 from safemr.report.tables import ABSENT
 
@@ -241,6 +242,7 @@ def write(
             table1=panels.get("table1"),
             claims=_claims(panels.get("claims"), {p.name for p in shown}, groups, points),
             claims_table=panels.get("claims"),
+            ours=OURS,
             sections=_sections(panels, shown),
             groups=groups,
             folder=target.parent,
