@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -93,17 +93,22 @@ class Plan:
     @property
     def seeds_told(self) -> str:
         """For captions: the seeds on the navigation tasks, and the variants with others."""
-        of: dict[str, set[int]] = {}
-        for run in self.navigation:
-            of.setdefault(run.variant, set()).add(run.seed)
-        said = {variant: told(seeds) for variant, seeds in of.items()}
-        ((most, _),) = Counter(said.values()).most_common(1) or [("", 0)]
-        others: dict[str, list[str]] = {}
-        for variant, seeds in said.items():
-            if seeds != most:
-                others.setdefault(seeds, []).append(variant)
-        rest = "; ".join(f"{', '.join(names)}: {seeds}" for seeds, names in others.items())
-        return f"{most} ({rest})" if rest else most
+        return seeds_told(self.navigation)
+
+
+def seeds_told(runs: Iterable[Run]) -> str:
+    """For a caption: the seeds of most variants, and the variants with others."""
+    of: dict[str, set[int]] = {}
+    for run in runs:
+        of.setdefault(run.variant, set()).add(run.seed)
+    said = {variant: told(seeds) for variant, seeds in of.items()}
+    ((most, _),) = Counter(said.values()).most_common(1) or [("", 0)]
+    others: dict[str, list[str]] = {}
+    for variant, seeds in said.items():
+        if seeds != most:
+            others.setdefault(seeds, []).append(variant)
+    rest = "; ".join(f"{', '.join(names)}: {seeds}" for seeds, names in others.items())
+    return f"{most} ({rest})" if rest else most
 
 
 def check_setting(

@@ -1,7 +1,17 @@
 # The points [a, b] of the regularizer. They are variants of the one training rule.
+from safemr.experiment.planning import seeds_told
+
+# The grid may have the base point, and the variant without [a, b], with more seeds than the study.
+AT_POINTS = [
+    run
+    for run in {run.path: run for run in (*PLAN.sensitivity, *PLAN.navigation)}.values()
+    if CONFIG.sensitivity and run.task == CONFIG.sensitivity.task
+    if run.variant in (*PLAN.points, ABLATION)
+]
 LEARNED_AT_POINTS = dict(
     task=CONFIG.sensitivity and CONFIG.sensitivity.task,
-    expected=expected(PLAN.sensitivity),
+    expected=expected(AT_POINTS),
+    seeds=seeds_told(AT_POINTS),
     method=CONFIG.sensitivity and CONFIG.sensitivity.variant,
     ablation=ABLATION,
     points={label: list(point) for label, point in PLAN.points.items()},
