@@ -108,18 +108,16 @@ def test_the_curves_are_the_fit() -> None:
 
 
 def test_the_figure_shows_a_mark_a_certificate_and_two_curves() -> None:
-    points = pd.concat([runs(1.5, noise=0.1), runs(0.0).assign(task="U").query("area > 0.95")])
-    made = regularizer.table(points, ["T", "U", "V"], "SafeMR", "JointSIS")
-    said = regularizer.in_words(made)
+    few, absent = runs(0.0).assign(task="U").query("area > 0.95"), runs(0.0).assign(task="W")
+    points, tasks = pd.concat([runs(1.5, noise=0.1), few, absent]), ["T", "U", "V", "W"]
+    made = regularizer.table(points, tasks, "SafeMR", "JointSIS", incomplete={"W"})
+    figure = at_equal_size(points, tasks, made)
+    said = [ax.get_title().partition("\n")[2] for ax in figure.axes]
     assert said[0].startswith("with [a, b] minus without, at equal size: 1.")
-    assert said[1:] == ["", ""]  # too few certificates, and none
-    figure = at_equal_size(points, ["T", "U", "V"], said)
-    enough, few, none = figure.axes
-    assert enough.get_title().endswith(said[0])
+    assert said[1:] == ["", "", "runs are missing"]  # too few certificates, none, not all runs
     marks = [sum(len(line.get_xdata()) for line in ax.lines if line.get_marker() in ("o", "s"))
              for ax in figure.axes]  # fmt: skip
-    assert marks == [8, 5, 0]
+    assert marks == [8, 5, 0, 8]
     curves = [sum(len(line.get_xdata()) == 60 for line in ax.lines) for ax in figure.axes]
-    assert curves == [2, 0, 0]
-    assert {text.get_text() for text in few.texts} <= {text.get_text() for text in enough.texts}
-    assert "no record" in none.texts[0].get_text()
+    assert curves == [2, 0, 0, 0]
+    assert "no record" in figure.axes[2].texts[0].get_text()

@@ -144,12 +144,21 @@ def table(
     return Table("regularizer", caption, pd.DataFrame(rows), display, [FEW])
 
 
-def in_words(table: Table) -> list[str]:
-    """Of each row what a figure's title says: gamma with its interval, where there is an answer."""
-    return [
-        f"with [a, b] minus without, at equal size: {row.added:.2f} [{row.added_low:.2f}, "
-        f"{row.added_high:.2f}]"
-        if row.certificates >= FEWEST and row.answer != MISSING
-        else ""
-        for row in table.data.itertuples()
-    ]
+def in_words(table: Table) -> dict[str, str]:
+    """Of each task what a figure's title says: gamma with its interval, where there is an answer."""
+    words = {}
+    for row in table.data.itertuples():
+        if row.answer == MISSING:
+            words[row.task] = "runs are missing"
+        elif row.certificates >= FEWEST:
+            ends = f"{row.added_low:.2f}, {row.added_high:.2f}"
+            words[row.task] = f"with [a, b] minus without, at equal size: {row.added:.2f} [{ends}]"
+        else:
+            words[row.task] = ""
+    return words
+
+
+def fitted(table: Table) -> set[str]:
+    """The tasks of which a figure shows the fit: all runs are there, and enough certificates."""
+    rows = table.data
+    return set(rows.loc[(rows["answer"] != MISSING) & (rows["certificates"] >= FEWEST), "task"])

@@ -35,7 +35,7 @@ made = regularizer.table(
     points, params.tasks, params.method, params.ablation, incomplete=set(absent["task"])
 )
 made.noted(*notes).write(Path(output.markdown).parent)
-figure = at_equal_size(points, params.tasks, regularizer.in_words(made))
+figure = at_equal_size(points, params.tasks, made)
 style.save(figure, Path(output.fit_pdf).with_suffix(""))
 figure = against_size(points, params.tasks, yardsticks)
 style.save(figure, Path(output.pdf).with_suffix(""))

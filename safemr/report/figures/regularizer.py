@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from safemr.report import regularizer, statistics
 from safemr.report.figures import style
 from safemr.report.figures.finding import name_marks
+from safemr.report.tables import Table
 
 # By whether [a, b] are in the loss: colour, marker, words.
 LOOKS = {
@@ -22,9 +23,9 @@ LOOKS = {
 }
 
 
-def draw(points: pd.DataFrame, ax: Axes) -> pd.DataFrame:
-    """A mark a certificate at its runs' mean area, with the interval of their returns, and what
-    `regularizer.curves` fits, where there are enough certificates.
+def draw(points: pd.DataFrame, ax: Axes, *, fit: bool) -> pd.DataFrame:
+    """A mark a certificate at its runs' mean area, with the interval of their returns, and with
+    ``fit`` the curves of `regularizer.curves`.
 
     points: runs on one task, as `regularizer.at_equal_size` takes them. Returns the marks.
     """
@@ -42,35 +43,35 @@ def draw(points: pd.DataFrame, ax: Axes) -> pd.DataFrame:
         look: dict[str, Any] = {"color": tint, "marker": marker, "ls": "none", "ms": 5}
         ax.vlines(area, part["return_low"], part["return_high"], color=tint, lw=0.9, zorder=2)
         ax.plot(area, part["return"], mec="white", mew=0.5, zorder=3, **look)
-    if len(marks) >= regularizer.FEWEST:
+    if fit:
         areas = np.linspace(marks["area"].min(), marks["area"].max(), 60)
-        fitted = regularizer.curves(points, areas)
-        for made, values in zip((False, True), fitted, strict=True):
+        for made, values in zip((False, True), regularizer.curves(points, areas), strict=True):
             ax.plot(areas, values, color=LOOKS[made][0], lw=1.2, zorder=1)
     ax.margins(x=0.1, y=0.16)
     return marks
 
 
 @style.styled
-def at_equal_size(points: pd.DataFrame, tasks: Sequence[str], said: Sequence[str]) -> Figure:
+def at_equal_size(points: pd.DataFrame, tasks: Sequence[str], table: Table) -> Figure:
     """One panel a task, all certificates with a speed term, named.
 
-    points: `safemr.report.sizes.merged`; said: of each task, what the table says of it.
+    points: `safemr.report.sizes.merged`; table: `regularizer.table` of them.
     """
+    said, fitted = regularizer.in_words(table), regularizer.fitted(table)
     columns = min(len(tasks), 2)
     rows = -(-len(tasks) // columns)
     width = style.TEXT_WIDTH if columns > 1 else style.COLUMN_WIDTH
     figure = style.new_figure(width, 0.5 + 2.5 * rows)
     axes = figure.subplots(rows, columns, squeeze=False)
     panels = []
-    for ax, task, words in zip(axes.flat, tasks, said, strict=False):
+    for ax, task in zip(axes.flat, tasks, strict=False):
         chosen = points[(points["task"] == task) & (points["k"] > 0)]
-        ax.set_title("\n".join([task, *([words] if words else [])]), linespacing=1.3)
+        ax.set_title("\n".join(filter(None, [task, said[task]])), linespacing=1.3)
         ax.set_xlabel("unsafe area (m$^2$)")
         if chosen.empty:
             style.note(ax, "no record: all runs")
             continue
-        panels.append((ax, draw(chosen, ax)))
+        panels.append((ax, draw(chosen, ax, fit=task in fitted)))
     for ax in axes.flat[len(tasks) :]:
         ax.remove()
     for ax in axes[:, 0]:
