@@ -145,7 +145,7 @@ def table(
 
 
 def in_words(table: Table) -> dict[str, str]:
-    """Of each task what a figure's title says: gamma with its interval, where there is an answer."""
+    """Of each task what a figure's title says: gamma and its interval, if it has an answer."""
     words = {}
     for row in table.data.itertuples():
         if row.answer == MISSING:

@@ -84,8 +84,9 @@ def at_equal_size(points: pd.DataFrame, tasks: Sequence[str], table: Table) -> F
     handles += [
         Line2D([], [], marker="|", ls="none", ms=9, mew=1.0, color="0.3",
                label="95% interval over seeds"),
-        Line2D([], [], **grey, label="least squares: area, its square, [a, b]"),
     ]  # fmt: skip
+    if fitted:
+        handles.append(Line2D([], [], **grey, label="least squares: area, its square, [a, b]"))
     style.legend_below(figure, handles, 4 if columns > 1 else 1)
     figure.draw_without_rendering()
     for ax, marks in panels:
